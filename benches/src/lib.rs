@@ -1,0 +1,1 @@
+//! raygrad's benches.

@@ -1,0 +1,2 @@
+//! raygrad's compiler: record, differentiate, simplify, fuse, plan.
+pub mod scalar;

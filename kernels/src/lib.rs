@@ -1,0 +1,2 @@
+//! raygrad's kernels: launches lowered to CPU tile programs and to naga modules.
+pub mod cpu;

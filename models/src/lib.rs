@@ -1,0 +1,1 @@
+//! raygrad: differentiable rendering.
