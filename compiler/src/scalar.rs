@@ -91,3 +91,53 @@ impl Prim {
         }
     }
 }
+
+/// An operand of a scalar instruction.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Val {
+    /// Operand of the op, by position.
+    Input(u8),
+    /// Bits of a constant lane.
+    Const(u32),
+    /// Result of an earlier instruction.
+    Inst(u16),
+}
+
+/// Straight-line program over 32-bit lanes.
+#[derive(Clone, Debug, PartialEq, Eq, Hash, Default)]
+pub struct ScalarProgram {
+    pub code: Vec<(Prim, Vec<Val>)>,
+}
+
+impl ScalarProgram {
+    /// Builds a program by running `build`, whose result must be the last instruction it emitted.
+    pub fn build(build: impl FnOnce(&mut ScalarBuilder) -> Val) -> ScalarProgram {
+        let mut b = ScalarBuilder::default();
+        let last = build(&mut b);
+        debug_assert_eq!(last, Val::Inst(b.0.code.len() as u16 - 1), "a scalar program ends in its result");
+        b.0
+    }
+    pub fn flops(&self) -> u64 {
+        self.code.iter().map(|(p, _)| p.flops()).sum()
+    }
+}
+
+/// Emits scalar instructions; what a pointwise op's `lower` writes to.
+#[derive(Default)]
+pub struct ScalarBuilder(ScalarProgram);
+
+impl ScalarBuilder {
+    pub fn emit(&mut self, prim: Prim, args: &[Val]) -> Val {
+        debug_assert_eq!(args.len(), prim.arity());
+        self.0.code.push((prim, args.to_vec()));
+        Val::Inst(self.0.code.len() as u16 - 1)
+    }
+    /// An `f32` constant.
+    pub fn f(&self, x: f32) -> Val {
+        Val::Const(x.to_bits())
+    }
+    /// A `u32` constant.
+    pub fn u(&self, x: u32) -> Val {
+        Val::Const(x)
+    }
+}

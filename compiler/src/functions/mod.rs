@@ -1,0 +1,1 @@
+//! Derived operations: plain functions of ops, with no rules of their own.

@@ -1,0 +1,190 @@
+//! Recording: a [`Tensor`] is an immutable node of the graph, shared by whatever uses it.
+//!
+//! There is no recorder object and no interior mutability: an op on tensors returns a new tensor that holds its operands.
+//! Identifiers grow with time, so sorting by identifier is a topological order, the same in every run.
+
+use super::axis::{Axes, Axis};
+use super::error::{Misfit, RecordError};
+use super::shape::{Channels, Shape};
+use crate::ops::{Op, input::Input};
+use crate::scalar::DType;
+use std::cell::Cell;
+use std::fmt;
+use std::panic::Location;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// A function from named axes to channels, recorded but not yet computed.
+#[derive(Clone)]
+pub struct Tensor(Arc<Node>);
+
+/// One recorded op.
+pub struct Node {
+    pub id: u64,
+    pub op: Arc<dyn Op>,
+    pub inputs: Vec<Tensor>,
+    pub shape: Shape,
+    /// The user's line that made it; a gradient carries the line of the op it is the gradient of.
+    pub source: &'static Location<'static>,
+    error: Option<Arc<RecordError>>,
+}
+
+static NEXT: AtomicU64 = AtomicU64::new(0);
+
+thread_local! {
+    static SOURCE: Cell<Option<&'static Location<'static>>> = const { Cell::new(None) };
+}
+
+/// Runs `f`; every tensor recorded inside gets the source line `at`. Used by the passes that record on a user's behalf.
+pub fn with_source<T>(at: &'static Location<'static>, f: impl FnOnce() -> T) -> T {
+    struct Reset(Option<&'static Location<'static>>);
+    impl Drop for Reset {
+        fn drop(&mut self) {
+            SOURCE.set(self.0);
+        }
+    }
+    let _reset = Reset(SOURCE.replace(Some(at)));
+    f()
+}
+
+impl Tensor {
+    /// Records `op` on `inputs`. If the operands do not fit, the result carries the error.
+    #[track_caller]
+    pub fn record(op: impl Op, inputs: &[&Tensor]) -> Tensor {
+        Tensor::record_arc(Arc::new(op), inputs.iter().map(|t| (*t).clone()).collect())
+    }
+
+    #[track_caller]
+    pub fn record_arc(op: Arc<dyn Op>, inputs: Vec<Tensor>) -> Tensor {
+        let source = SOURCE.get().unwrap_or(Location::caller());
+        let shapes: Vec<Shape> = inputs.iter().map(|t| t.shape().clone()).collect();
+        let poisoned = inputs.iter().find_map(|t| t.0.error.clone());
+        let (shape, error) = match (poisoned, op.shape(&shapes)) {
+            (Some(e), Ok(shape)) => (shape, Some(e)),
+            (Some(e), Err(_)) => (Shape::new(&[], 1), Some(e)),
+            (None, Ok(shape)) => (shape, name_clash(&op, &inputs, source)),
+            (None, Err(m)) => (Shape::new(&[], 1), Some(Arc::new(record_error(&op, &inputs, m, source)))),
+        };
+        let id = NEXT.fetch_add(1, Ordering::Relaxed);
+        Tensor(Arc::new(Node { id, op, inputs, shape, source, error }))
+    }
+
+    /// A tensor that only carries an error, for derived functions that check their arguments.
+    #[track_caller]
+    pub fn misfit(name: &'static str, operands: &[&Tensor], problem: impl Into<String>, hint: impl Into<String>) -> Tensor {
+        Tensor::record(crate::ops::input::Refused { name, misfit: Misfit::new(problem, hint) }, operands)
+    }
+
+    pub fn node(&self) -> &Node {
+        &self.0
+    }
+    pub fn id(&self) -> u64 {
+        self.0.id
+    }
+    pub fn op(&self) -> &Arc<dyn Op> {
+        &self.0.op
+    }
+    pub fn inputs(&self) -> &[Tensor] {
+        &self.0.inputs
+    }
+    pub fn shape(&self) -> &Shape {
+        &self.0.shape
+    }
+    pub fn axes(&self) -> &Axes {
+        &self.0.shape.axes
+    }
+    pub fn channels(&self) -> Channels {
+        self.0.shape.channels
+    }
+    /// Number of channels.
+    pub fn width(&self) -> usize {
+        self.0.shape.channels.count()
+    }
+    pub fn dtype(&self) -> DType {
+        self.0.shape.dtype
+    }
+    pub fn source(&self) -> &'static Location<'static> {
+        self.0.source
+    }
+    /// The first recording error among this tensor and everything it is computed from.
+    pub fn error(&self) -> Option<&RecordError> {
+        self.0.error.as_deref()
+    }
+    /// The op downcast to its concrete type, for rewrite rules.
+    pub fn op_as<T: Op>(&self) -> Option<&T> {
+        let any: &dyn std::any::Any = &**self.op();
+        any.downcast_ref::<T>()
+    }
+    /// Name of an input tensor, `None` for computed ones.
+    pub fn input_name(&self) -> Option<&str> {
+        self.op_as::<Input>().map(|i| &*i.name)
+    }
+}
+
+fn record_error(op: &Arc<dyn Op>, inputs: &[Tensor], m: Misfit, source: &'static Location<'static>) -> RecordError {
+    RecordError {
+        op: op.name().to_string(),
+        operands: inputs.iter().map(|t| (t.shape().clone(), t.source())).collect(),
+        problem: m.problem,
+        hint: m.hint,
+        source,
+    }
+}
+
+/// Two different axes of one name in one op are nearly always a mistake: the user made the axis twice.
+fn name_clash(op: &Arc<dyn Op>, inputs: &[Tensor], source: &'static Location<'static>) -> Option<Arc<RecordError>> {
+    let mut seen: Vec<&Axis> = vec![];
+    for a in inputs.iter().flat_map(|t| t.axes()) {
+        match seen.iter().find(|b| b.name() == a.name()) {
+            Some(b) if *b != a => {
+                let problem = if a.size() == b.size() {
+                    format!("two different axes are called `{}`", a.name())
+                } else {
+                    format!("axis `{}` has size {} in one operand and {} in another", a.name(), b.size(), a.size())
+                };
+                let m = Misfit::new(problem, "make the axis once with Axis::new and clone it, or give the second another name");
+                return Some(Arc::new(record_error(op, inputs, m, source)));
+            }
+            Some(_) => {}
+            None => seen.push(a),
+        }
+    }
+    None
+}
+
+/// All tensors that `roots` are computed from, operands before users.
+pub fn topological(roots: impl IntoIterator<Item = Tensor>) -> Vec<Tensor> {
+    let mut seen = std::collections::HashSet::new();
+    let mut stack: Vec<Tensor> = roots.into_iter().collect();
+    let mut all = vec![];
+    while let Some(t) = stack.pop() {
+        if seen.insert(t.id()) {
+            stack.extend(t.inputs().iter().cloned());
+            all.push(t);
+        }
+    }
+    all.sort_by_key(Tensor::id);
+    all
+}
+
+impl fmt::Debug for Tensor {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        write!(f, "%{} = {:?}", self.id(), self.op())?;
+        for i in self.inputs() {
+            write!(f, " %{}", i.id())?;
+        }
+        write!(f, ": {}", self.shape())
+    }
+}
+
+/// Long chains are freed in a loop: a recursive drop would overflow the stack.
+impl Drop for Node {
+    fn drop(&mut self) {
+        let mut stack = std::mem::take(&mut self.inputs);
+        while let Some(t) = stack.pop() {
+            if let Some(mut node) = Arc::into_inner(t.0) {
+                stack.append(&mut node.inputs);
+            }
+        }
+    }
+}

@@ -1,0 +1,147 @@
+//! Sum and maximum over axes.
+
+use super::{Form, Op, Reduction, Sample, SampleInput, expect_dtype};
+use crate::graph::{Axes, Axis, Misfit, Shape, Tensor};
+use crate::reference::Array;
+use crate::scalar::DType;
+
+/// Reduction over `over`.
+#[derive(Clone, Debug)]
+pub struct Reduce {
+    pub kind: Reduction,
+    pub over: Axes,
+}
+
+impl Op for Reduce {
+    fn name(&self) -> &'static str {
+        match self.kind {
+            Reduction::Sum => "sum",
+            Reduction::Max => "max_over",
+        }
+    }
+    fn shape(&self, inputs: &[Shape]) -> Result<Shape, Misfit> {
+        expect_dtype(&inputs[0], DType::F32, 0)?;
+        if !self.over.is_subset(&inputs[0].axes) {
+            return Err(Misfit::new(
+                format!("{} has no axes {} to reduce", inputs[0], self.over),
+                format!("axes here: {}", inputs[0].axes),
+            ));
+        }
+        Ok(inputs[0].clone().with_axes(inputs[0].axes.minus(&self.over)))
+    }
+    fn form(&self) -> Form {
+        Form::Reduce(self.kind)
+    }
+    fn eval(&self, inputs: &[&Array], out: &Shape) -> Array {
+        let x = inputs[0];
+        let n = out.channels.count();
+        let mut y = Array::zeros(out);
+        if self.kind == Reduction::Max {
+            y.f_mut().fill(f64::NEG_INFINITY);
+        }
+        for e in 0..x.shape.axes.elements() {
+            let at = y.element_of(&x.shape, e);
+            for c in 0..n {
+                let v = x.at(e, c).f();
+                let slot = &mut y.f_mut()[at * n + c];
+                *slot = match self.kind {
+                    Reduction::Sum => *slot + v,
+                    Reduction::Max => slot.max(v),
+                };
+            }
+        }
+        y
+    }
+    fn vjp(&self, inputs: &[Tensor], output: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
+        let x = &inputs[0];
+        let grad = match self.kind {
+            // Broadcasting back is implicit, but the rows must carry the axes that were summed.
+            Reduction::Sum => g.broadcast_to(x.axes()),
+            Reduction::Max => {
+                let hit = x.equal(output).to_f32();
+                let ties = hit.sum_over(&self.over);
+                hit * (g / ties)
+            }
+        };
+        vec![Some(grad)]
+    }
+    fn flops(&self, _: &[Shape], out: &Shape) -> u64 {
+        out.channels.count() as u64
+    }
+}
+
+impl Tensor {
+    /// Sum over the given axes.
+    #[track_caller]
+    pub fn sum(&self, over: &[&Axis]) -> Tensor {
+        self.sum_over(&Axes::new(over.iter().map(|a| (*a).clone())))
+    }
+    #[track_caller]
+    pub fn sum_over(&self, over: &Axes) -> Tensor {
+        if over.is_empty() {
+            return self.clone();
+        }
+        Tensor::record(Reduce { kind: Reduction::Sum, over: over.clone() }, &[self])
+    }
+    /// Mean over the given axes.
+    #[track_caller]
+    pub fn mean(&self, over: &[&Axis]) -> Tensor {
+        let n: usize = over.iter().map(|a| a.size()).product();
+        self.sum(over) * (1.0 / n as f64)
+    }
+    /// Mean over all axes and channels.
+    #[track_caller]
+    pub fn mean_all(&self) -> Tensor {
+        let n = self.shape().lanes();
+        self.sum_channels().sum_over(self.axes()) * (1.0 / n as f64)
+    }
+    /// Maximum over the given axes. Its gradient is shared equally between ties.
+    #[track_caller]
+    pub fn max_over(&self, over: &[&Axis]) -> Tensor {
+        let over = Axes::new(over.iter().map(|a| (*a).clone()));
+        Tensor::record(Reduce { kind: Reduction::Max, over }, &[self])
+    }
+    /// The same values with all of `axes`: repeated along those this tensor lacks.
+    #[track_caller]
+    pub fn broadcast_to(&self, axes: &Axes) -> Tensor {
+        if axes.is_subset(self.axes()) { self.clone() } else { Tensor::record(Broadcast(axes.clone()), &[self]) }
+    }
+}
+
+/// The operand, with more axes. Recorded only by rules: elementwise ops broadcast by themselves.
+#[derive(Clone, Debug)]
+pub struct Broadcast(pub Axes);
+
+impl Op for Broadcast {
+    fn name(&self) -> &'static str {
+        "broadcast"
+    }
+    fn shape(&self, inputs: &[Shape]) -> Result<Shape, Misfit> {
+        Ok(inputs[0].clone().with_axes(inputs[0].axes.union(&self.0)))
+    }
+    fn form(&self) -> Form {
+        Form::Identity
+    }
+    fn eval(&self, inputs: &[&Array], out: &Shape) -> Array {
+        Array::from_fn(out, |e, c| inputs[0].lane(out, e, c))
+    }
+    fn vjp(&self, _: &[Tensor], _: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
+        vec![Some(g.clone())]
+    }
+}
+
+pub fn samples() -> Vec<Sample> {
+    let (frame, row) = (Axis::new("frame", 3), Axis::new("row", 4));
+    let x = || vec![SampleInput::new(Shape::new(&[&frame, &row], 2), -1.0, 1.0)];
+    let (f, f2, r, r2, r3) = (frame.clone(), frame.clone(), row.clone(), row.clone(), row.clone());
+    vec![
+        Sample::new("sum over the inner axis", x(), move |x| x[0].sum(&[&r])),
+        Sample::new("sum over the outer axis", x(), move |x| x[0].sum(&[&f])),
+        Sample::new("sum over all axes", x(), move |x| x[0].sum(&[&f2, &r2])),
+        Sample::new("mean_all", x(), |x| x[0].mean_all()),
+        Sample::new("max_over", x(), move |x| x[0].max_over(&[&r3])),
+        Sample::new("broadcast", vec![SampleInput::new(Shape::new(&[&frame], 2), -1.0, 1.0)], move |x| {
+            x[0].broadcast_to(&Axes::new([frame.clone(), row.clone()]))
+        }),
+    ]
+}
