@@ -1,7 +1,7 @@
 //! Speed of the CPU kernels on one thread: matrix kernels in per cent of the multiply-add peak that is measured right
 //! before and after, functions in nanoseconds per value.
 //!
-//! `cargo run --release -p raygrad-kernels --example gemm_peak [-- <seconds per case>]`
+//! `cargo run --release -p raygrad-kernels --example gemm_peak [-- <seconds per case> <instruction set>]`
 use raygrad_compiler::scalar::Prim;
 use raygrad_kernels::cpu::*;
 use std::time::Instant;
@@ -23,17 +23,20 @@ fn time(seconds: f64, mut f: impl FnMut(usize)) -> f64 {
     start.elapsed().as_secs_f64() / calls as f64
 }
 
-/// Prints the best and the median of a few per cent figures, each relative to the peak around it.
+/// Prints quartiles of many short measurements, each relative to the peak right before and after it.
 fn report(name: &str, flops: f64, seconds: f64, mut f: impl FnMut(usize)) {
-    let mut percent: Vec<f64> = (0..9)
+    const WINDOWS: usize = 41;
+    let mut before = peak_gflops(1, 1.0);
+    let mut percent: Vec<f64> = (0..WINDOWS)
         .map(|_| {
-            let before = peak_gflops(1, 10.0);
-            let rate = flops / time(seconds, &mut f) * 1e-9;
-            rate / (0.5 * (before + peak_gflops(1, 10.0))) * 100.0
+            let rate = flops / time(seconds / WINDOWS as f64, &mut f) * 1e-9;
+            let after = peak_gflops(1, 1.0);
+            rate / (0.5 * (std::mem::replace(&mut before, after) + after)) * 100.0
         })
         .collect();
     percent.sort_by(f64::total_cmp);
-    println!("{name:38} {:6.1} % median, {:6.1} % best", percent[4], percent[8]);
+    let [low, median, high] = [1, 2, 3].map(|q| percent[WINDOWS * q / 4]);
+    println!("{name:36} {median:6.1} % of peak (quartiles {low:.1} .. {high:.1})");
 }
 
 fn filled(len: usize) -> AlignedVec {
@@ -95,9 +98,10 @@ fn functions(isa: Isa, seconds: f64) {
 }
 
 fn main() {
-    let seconds = std::env::args().nth(1).and_then(|s| s.parse().ok()).unwrap_or(0.05);
+    let seconds = std::env::args().nth(1).and_then(|s| s.parse().ok()).unwrap_or(0.15);
     println!("peak of one thread: {:.1} GFLOP/s ({})", peak_gflops(1, 200.0), Isa::detect());
-    for isa in Isa::available() {
+    let only = std::env::args().nth(2);
+    for isa in Isa::available().into_iter().filter(|isa| only.as_ref().is_none_or(|name| isa.to_string() == *name)) {
         for (k, n, rows) in [(256, 256, 192), (256, 256, 96), (34, 256, 192), (64, 64, 192), (256, 3, 192)] {
             matrix_kernels(isa, k, n, rows, seconds);
         }

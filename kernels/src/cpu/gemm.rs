@@ -140,23 +140,54 @@ impl Gemm {
                 x = x.wrapping_add(self.ldx);
                 weights = weights.wrapping_add(PANEL);
             }
+            self.finish::<S, MR, NV>(&mut acc, output, row);
             for i in 0..MR {
                 for j in 0..NV {
-                    let at = row + j * S::LANES;
-                    let y = self.y.add((output + i) * self.ldy + at);
-                    let mut v = acc[i][j];
-                    if self.accumulate {
-                        v = S::add(S::load(y), v);
+                    S::store(self.y.add((output + i) * self.ldy + row + j * S::LANES), acc[i][j]);
+                }
+            }
+        }
+    }
+
+    /// Applies the old `y` and the epilogue to the accumulators of a block. One loop per case, because the compiler keeps
+    /// accumulators in registers only in loops simple enough to be unrolled.
+    ///
+    /// # Safety
+    /// As [`Gemm::block`].
+    #[inline(always)]
+    unsafe fn finish<S: Simd, const MR: usize, const NV: usize>(
+        &self,
+        acc: &mut [[S::V; NV]; MR],
+        output: usize,
+        row: usize,
+    ) {
+        // SAFETY: the block lies inside `y` and `h`.
+        unsafe {
+            if self.accumulate {
+                for i in 0..MR {
+                    for j in 0..NV {
+                        let y = self.y.add((output + i) * self.ldy + row + j * S::LANES);
+                        acc[i][j] = S::add(S::load(y), acc[i][j]);
                     }
-                    match self.epilogue {
-                        Epilogue::None => {}
-                        Epilogue::Relu => v = S::max(v, zero),
-                        Epilogue::Mask { h, ldh } => {
-                            let active = S::lt(zero, S::load(h.add((output + i) * ldh + at)));
-                            v = S::select(active, v, zero);
+                }
+            }
+            let zero = S::splat(0.0);
+            match self.epilogue {
+                Epilogue::None => {}
+                Epilogue::Relu => {
+                    for i in 0..MR {
+                        for j in 0..NV {
+                            acc[i][j] = S::max(acc[i][j], zero);
                         }
                     }
-                    S::store(y, v);
+                }
+                Epilogue::Mask { h, ldh } => {
+                    for i in 0..MR {
+                        for j in 0..NV {
+                            let active = S::lt(zero, S::load(h.add((output + i) * ldh + row + j * S::LANES)));
+                            acc[i][j] = S::select(active, acc[i][j], zero);
+                        }
+                    }
                 }
             }
         }
