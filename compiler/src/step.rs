@@ -43,7 +43,8 @@ impl Step {
             return Err(StepError::Empty);
         }
         let targets = self.updates.iter().map(|(input, _)| input);
-        if let Some(e) = self.roots().iter().chain(targets.clone()).find_map(Tensor::error) {
+        let roots = self.roots();
+        if let Some(e) = roots.iter().chain(targets.clone()).find_map(Tensor::error) {
             return Err(StepError::Record(e.clone()));
         }
         let mut names: HashMap<&str, &Input> = HashMap::new();
@@ -59,7 +60,8 @@ impl Step {
         }
         let mut updated = std::collections::HashSet::new();
         for (target, value) in &self.updates {
-            let Some(input) = target.op_as::<Input>().filter(|i| matches!(i.role, Role::Parameter | Role::State)) else {
+            let Some(input) = target.op_as::<Input>().filter(|i| matches!(i.role, Role::Parameter | Role::State))
+            else {
                 return Err(StepError::NotAnInput(format!("{target:?}")));
             };
             if !updated.insert(&input.name) {

@@ -68,7 +68,12 @@ pub fn fuse(roots: &[Tensor], target: Target) -> Fused {
         computed_before.extend(nodes);
     }
     let roots = roots.iter().map(|r| builder.buffer(r)).collect();
-    Fused { regions: regions.into_iter().map(|(r, _)| merge::merge(r)).collect(), buffers: builder.buffers, roots, recomputed }
+    Fused {
+        regions: regions.into_iter().map(|(r, _)| merge::merge(r)).collect(),
+        buffers: builder.buffers,
+        roots,
+        recomputed,
+    }
 }
 
 struct Builder {
@@ -119,7 +124,8 @@ impl Builder {
         }
         debug_assert!(info.domain == key.domain && info.depth < key.depth, "{t:?} of another domain must be stored");
         let per_channel = info.closure_flops / t.width().max(1) as u64;
-        let worth_storing = per_channel > self.cuts.target.recompute_flops && t.width() <= self.cuts.target.store_channels;
+        let worth_storing =
+            per_channel > self.cuts.target.recompute_flops && t.width() <= self.cuts.target.store_channels;
         if worth_storing {
             self.store(t);
         }
@@ -178,9 +184,12 @@ impl Builder {
             let buffer = self.buffer(&t);
             let store = match &form {
                 Form::Reduce(kind) => Store::Reduce { kind: *kind, value: value(&operands[0]), buffer },
-                Form::Scatter { axis } => {
-                    Store::Scatter { value: value(&operands[0]), index: value(&operands[1]), axis: axis.clone(), buffer }
-                }
+                Form::Scatter { axis } => Store::Scatter {
+                    value: value(&operands[0]),
+                    index: value(&operands[1]),
+                    axis: axis.clone(),
+                    buffer,
+                },
                 _ if region.inner.as_ref().is_some_and(|i| t.axes().contains(i)) => {
                     let inputs = operands.iter().map(value).collect();
                     let product = push_as(region, &t, RegionOp::RowOuter, inputs, region.domain.clone());
@@ -229,7 +238,9 @@ impl Builder {
                 return self.write(region, values, &t, stored);
             }
             Form::SymEig { n } => RegionOp::SymEig { n },
-            Form::Input | Form::Reduce(_) | Form::Scatter { .. } => unreachable!("loads and reductions are handled above"),
+            Form::Input | Form::Reduce(_) | Form::Scatter { .. } => {
+                unreachable!("loads and reductions are handled above")
+            }
         };
         let inputs = operands.iter().map(value).collect();
         values.insert(id, push(region, &t, op, inputs));
@@ -270,4 +281,3 @@ fn push_as(region: &mut Region, t: &Tensor, op: RegionOp, inputs: Vec<InstId>, a
     region.body.push(Inst { op, inputs, axes, channels: t.width(), dtype, label, source: t.source() });
     InstId(region.body.len() as u32 - 1)
 }
-

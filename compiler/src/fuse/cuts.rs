@@ -128,7 +128,9 @@ impl Cuts {
             .fold(own, |a, b| a.saturating_add(b));
         info.free = match &info.form {
             Form::Input | Form::Const(_) | Form::Index { .. } => true,
-            Form::Take { .. } => matches!(self.get(&info.operands[0]).form, Form::Input) && self.get(&info.operands[1]).free,
+            Form::Take { .. } => {
+                matches!(self.get(&info.operands[0]).form, Form::Input) && self.get(&info.operands[1]).free
+            }
             Form::Pointwise(_) | Form::Pick(_) | Form::ChannelSum(_) | Form::Identity => {
                 info.operands.iter().all(|o| self.get(o).free)
             }
@@ -195,7 +197,8 @@ impl Cuts {
                 users.entry(o.id()).or_default().push((*id, i));
             }
         }
-        let last = roots.iter().map(|r| self.get(r)).filter(|i| i.domain.is_empty()).map(|i| i.depth).max().unwrap_or(0);
+        let last =
+            roots.iter().map(|r| self.get(r)).filter(|i| i.domain.is_empty()).map(|i| i.depth).max().unwrap_or(0);
         for id in self.order.clone().into_iter().rev() {
             let info = &self.nodes[&id];
             if info.free || info.reduces {

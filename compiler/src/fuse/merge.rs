@@ -49,12 +49,8 @@ pub(super) fn merge(region: Region) -> Region {
         let args: Vec<Val> = operands.iter().map(|o| merged.operand(o)).collect();
         merged.append(&program, &args);
         label.push(inst.label.clone());
-        body[at] = Inst {
-            op: RegionOp::Map(Arc::new(merged.program)),
-            inputs: merged.inputs,
-            label: label.join("+"),
-            ..inst
-        };
+        body[at] =
+            Inst { op: RegionOp::Map(Arc::new(merged.program)), inputs: merged.inputs, label: label.join("+"), ..inst };
     }
     sweep(Region { body, ..region })
 }

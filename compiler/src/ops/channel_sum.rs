@@ -37,7 +37,9 @@ impl Op for ChannelSum {
         let mut hash = blake3::Hasher::new();
         for group in self.0.iter() {
             hash.update(&(group.len() as u32).to_le_bytes());
-            group.iter().for_each(|c| drop(hash.update(&c.to_le_bytes())));
+            for c in group {
+                hash.update(&c.to_le_bytes());
+            }
         }
         format!("sum_channels {}", hash.finalize())
     }

@@ -77,8 +77,7 @@ pub fn compile(step: &Step, target: &Target) -> Result<Program, StepError> {
     let fused_at = Instant::now();
     let mut program = plan(&step, fused, *target);
     program.ops = recorded;
-    program.timing =
-        Timing { simplify: simplified - start, fuse: fused_at - simplified, plan: fused_at.elapsed() };
+    program.timing = Timing { simplify: simplified - start, fuse: fused_at - simplified, plan: fused_at.elapsed() };
     spec::check(&program);
     Ok(program)
 }
@@ -166,12 +165,13 @@ fn replaces_in_place(launches: &[Launch], value: BufferId, old: BufferId, buffer
     let whole = region.domain == shape.axes
         && shape.axes == buffers[value.0 as usize].shape.axes
         && region.stores.iter().any(|s| matches!(s, Store::Write { buffer, .. } if *buffer == value));
-    let elementwise = region.body.iter().all(|i| match &i.op {
-        RegionOp::Load(b) => *b != old || i.axes == region.domain,
-        RegionOp::Take { table, .. } => *table != old,
-        RegionOp::Linear(w) => w.buffer != old,
-        _ => true,
-    }) && !region.body.iter().any(|i| matches!(i.op, RegionOp::Pick(_)) && region.grain == region::Grain::Lane);
+    let elementwise =
+        region.body.iter().all(|i| match &i.op {
+            RegionOp::Load(b) => *b != old || i.axes == region.domain,
+            RegionOp::Take { table, .. } => *table != old,
+            RegionOp::Linear(w) => w.buffer != old,
+            _ => true,
+        }) && !region.body.iter().any(|i| matches!(i.op, RegionOp::Pick(_)) && region.grain == region::Grain::Lane);
     let later = launches[writer + 1..].iter().any(|l| l.region.reads().contains(&old));
     whole && elementwise && !later
 }

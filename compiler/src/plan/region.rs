@@ -43,18 +43,31 @@ pub enum RegionOp {
     /// Contracts the operand's channels with weights that do not vary along the inner axis.
     Linear(Weights),
     /// The same with weights as the second operand, `rows x columns` channels varying along the inner axis.
-    RowLinear { rows: usize, columns: usize, transposed: bool },
+    RowLinear {
+        rows: usize,
+        columns: usize,
+        transposed: bool,
+    },
     /// All products of a channel of operand 0 and one of operand 1.
     RowOuter,
     /// Exclusive cumulative sum along the inner axis.
-    CumSum { reverse: bool },
+    CumSum {
+        reverse: bool,
+    },
     /// `y[i] = x[i - by]` along the inner axis, 0 outside.
-    Shift { by: i64 },
+    Shift {
+        by: i64,
+    },
     /// Position along an axis of the domain.
     Index(Axis),
     /// The table's element at operand 0 along `axis`, clamped to the last one.
-    Take { table: BufferId, axis: Axis },
-    SymEig { n: usize },
+    Take {
+        table: BufferId,
+        axis: Axis,
+    },
+    SymEig {
+        n: usize,
+    },
 }
 
 /// One value of a region.

@@ -1,7 +1,7 @@
 //! What a program may contain, checked after planning in debug builds and tests.
 
-use super::{BufferKind, Program};
 use super::region::{RegionOp, Store};
+use super::{BufferKind, Program};
 
 /// Panics, in debug builds only, if the compiler built a program that breaks its own rules.
 pub(super) fn check(program: &Program) {
@@ -13,8 +13,7 @@ pub(super) fn check(program: &Program) {
 }
 
 fn verify(program: &Program) -> Result<(), String> {
-    let mut written: Vec<bool> =
-        program.buffers.iter().map(|b| matches!(b.kind, BufferKind::Input { .. })).collect();
+    let mut written: Vec<bool> = program.buffers.iter().map(|b| matches!(b.kind, BufferKind::Input { .. })).collect();
     for launch in &program.launches {
         let (region, name) = (&launch.region, &launch.name);
         for b in region.reads() {
@@ -37,7 +36,8 @@ fn verify(program: &Program) -> Result<(), String> {
                 RegionOp::Linear(w) => {
                     let k = region.inst(inst.inputs[0]).channels;
                     let (contracted, out) = if w.transposed { (w.columns, w.rows) } else { (w.rows, w.columns) };
-                    let inner_free = region.inner.as_ref().is_none_or(|a| !program.buffer(w.buffer).shape.axes.contains(a));
+                    let inner_free =
+                        region.inner.as_ref().is_none_or(|a| !program.buffer(w.buffer).shape.axes.contains(a));
                     k == contracted && out == inst.channels && inner_free
                 }
                 RegionOp::Pick(pick) => pick.iter().all(|(o, c)| {

@@ -8,8 +8,8 @@ mod rules;
 mod split;
 
 use crate::graph::{Tensor, topological, with_source};
+use crate::ops::Form;
 use crate::ops::constant::Constant;
-use crate::ops::{Form, Op};
 use crate::step::Step;
 use std::collections::HashMap;
 use std::sync::Arc;

@@ -105,8 +105,11 @@ fn drop_broadcast(t: &Tensor) -> Option<Tensor> {
     if !pointwise || t.inputs().iter().all(|i| i.op_as::<Broadcast>().is_none()) {
         return None;
     }
-    let bare: Vec<Tensor> =
-        t.inputs().iter().map(|i| if i.op_as::<Broadcast>().is_some() { i.inputs()[0].clone() } else { i.clone() }).collect();
+    let bare: Vec<Tensor> = t
+        .inputs()
+        .iter()
+        .map(|i| if i.op_as::<Broadcast>().is_some() { i.inputs()[0].clone() } else { i.clone() })
+        .collect();
     // The broadcast moves behind the op, towards its users.
     Some(Tensor::record_arc(t.op().clone(), bare).broadcast_to(t.axes()))
 }
@@ -130,7 +133,11 @@ fn picks(t: &Tensor) -> Option<Tensor> {
     if used.len() < t.inputs().len() {
         let kept: Vec<Tensor> = used.iter().map(|i| t.inputs()[*i].clone()).collect();
         let place = |old: u32| used.iter().position(|u| *u == old as usize).unwrap_or_default() as u32;
-        let op = Pick { pick: pick.pick.iter().map(|p| (place(p.0), p.1)).collect(), channels: pick.channels, name: pick.name };
+        let op = Pick {
+            pick: pick.pick.iter().map(|p| (place(p.0), p.1)).collect(),
+            channels: pick.channels,
+            name: pick.name,
+        };
         let narrower = Tensor::record_arc(std::sync::Arc::new(op), kept);
         return Some(narrower.broadcast_to(t.axes()));
     }
@@ -189,4 +196,3 @@ fn reductions(t: &Tensor) -> Option<Tensor> {
     }
     None
 }
-

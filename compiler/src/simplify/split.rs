@@ -128,4 +128,3 @@ fn weights(t: &Tensor) -> Option<Tensor> {
     let op = Pick { pick: pick.into(), channels: t.channels(), name: "concat" };
     Some(Tensor::record_arc(std::sync::Arc::new(op), blocks))
 }
-
