@@ -20,6 +20,7 @@ mod simd;
 mod simd_portable;
 #[cfg(target_arch = "x86_64")]
 mod simd_x86;
+pub mod tile;
 pub mod vector;
 
 #[cfg(test)]
