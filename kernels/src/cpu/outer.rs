@@ -10,8 +10,8 @@ use super::simd::{Kernel, Simd, launch};
 pub const BLOCK: usize = 4;
 /// Floats of a block.
 const BLOCK_LEN: usize = BLOCK * BLOCK;
-/// Column blocks that are visited for one strip of `x` before the next strip: their rows of `d` stay in the L1 cache.
-const COLUMN_GROUP: usize = 8;
+/// Floats of `d` that stay in the L1 cache while all strips of `x` pass by: half of a small cache.
+const RESIDENT: usize = 4096;
 
 /// Operands of [`outer`].
 #[derive(Clone, Copy, Debug)]
@@ -88,9 +88,10 @@ impl Outer {
     #[inline(always)]
     unsafe fn blocks<S: Simd, const N: usize>(&self) {
         let (row_blocks, column_blocks) = (self.k.div_ceil(BLOCK), self.n.div_ceil(BLOCK));
+        let group = (RESIDENT / (BLOCK * self.rows.max(1))).max(2);
         let mut first = 0;
         while first < column_blocks {
-            let last = column_blocks.min(first + COLUMN_GROUP);
+            let last = column_blocks.min(first + group);
             for kb in 0..row_blocks {
                 for nb in first..last {
                     // SAFETY: block (kb, nb) lies inside `g`. An edge block goes to a zeroed copy first.

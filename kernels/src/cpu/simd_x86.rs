@@ -185,7 +185,7 @@ impl Simd for Avx512 {
 unsafe fn sums_of_row(a: __m512, b: __m512, c: __m512, d: __m512) -> __m512 {
     // SAFETY: register operations of AVX-512.
     unsafe {
-        // [a0+a2 a1+a3 b2+b0 b3+b1] in every quarter, likewise for c and d; a blend is cheaper than a shuffle.
+        // [a0+a2 a1+a3 b2+b0 b3+b1] in every quarter, likewise for c and d.
         let ab = _mm512_add_ps(_mm512_mask_blend_ps(0xcccc, a, b), _mm512_shuffle_ps::<0b01_00_11_10>(a, b));
         let cd = _mm512_add_ps(_mm512_mask_blend_ps(0xcccc, c, d), _mm512_shuffle_ps::<0b01_00_11_10>(c, d));
         _mm512_add_ps(_mm512_shuffle_ps::<0b10_00_10_00>(ab, cd), _mm512_shuffle_ps::<0b11_01_11_01>(ab, cd))
