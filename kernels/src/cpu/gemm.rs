@@ -50,14 +50,14 @@ pub struct Gemm {
 pub unsafe fn gemm(isa: Isa, args: Gemm) {
     debug_assert_eq!(args.rows % ROW_BLOCK, 0);
     // SAFETY: forwarded contract.
-    unsafe { launch(isa, args) }
+    unsafe { launch(isa, &args) }
 }
 
 impl Kernel for Gemm {
     type Out = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    unsafe fn run<S: Simd>(&self) {
         // SAFETY: forwarded contract. `NV * LANES` divides `ROW_BLOCK`.
         unsafe {
             if S::WIDE {

@@ -43,7 +43,7 @@ pub fn outer_len(k: usize, n: usize) -> usize {
 pub unsafe fn outer(isa: Isa, args: Outer) {
     debug_assert_eq!(args.rows % 16, 0);
     // SAFETY: forwarded contract.
-    unsafe { launch(isa, args) }
+    unsafe { launch(isa, &args) }
 }
 
 /// Copies (or adds) a blocked accumulator to the row-major `[k][n]` matrix `out`.
@@ -68,7 +68,7 @@ impl Kernel for Outer {
     type Out = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    unsafe fn run<S: Simd>(&self) {
         // SAFETY: forwarded contract.
         unsafe {
             if S::WIDE {

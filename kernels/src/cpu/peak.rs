@@ -29,7 +29,7 @@ fn rate(isa: Isa, limit: Duration) -> f64 {
     let mut flops = 0.0;
     loop {
         // SAFETY: `isa` was detected, and the kernel touches no memory.
-        flops += unsafe { launch(isa, Chains) };
+        flops += unsafe { launch(isa, &Chains) };
         let elapsed = start.elapsed();
         if elapsed >= limit {
             return flops / elapsed.as_secs_f64() * 1e-9;
@@ -44,7 +44,7 @@ impl Kernel for Chains {
     type Out = f64;
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) -> f64 {
+    unsafe fn run<S: Simd>(&self) -> f64 {
         // SAFETY: forwarded contract.
         unsafe { if S::WIDE { chains::<S, CHAINS_WIDE>() } else { chains::<S, CHAINS_NARROW>() } }
     }

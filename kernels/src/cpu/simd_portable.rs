@@ -1,5 +1,15 @@
 //! Vectors as arrays of eight lanes, for targets without hand-picked instructions; the compiler vectorises the loops.
-use super::simd::Simd;
+use super::simd::{Kernel, Simd};
+
+/// Runs `kernel` with arrays; a function of its own, so that its stack frame does not burden the dispatch.
+///
+/// # Safety
+/// The kernel's contract holds.
+#[inline(never)]
+pub(super) unsafe fn run_portable<K: Kernel>(kernel: &K) -> K::Out {
+    // SAFETY: these vectors need no CPU feature; the caller vouches for the kernel's contract.
+    unsafe { kernel.run::<Portable>() }
+}
 
 /// Plain Rust lanes.
 pub(super) struct Portable;

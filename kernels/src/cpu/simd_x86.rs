@@ -7,7 +7,7 @@ use std::arch::x86_64::*;
 /// # Safety
 /// The CPU has AVX-512 F, VL, DQ, BW, AVX2 and FMA, and the kernel's contract holds.
 #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
-pub(super) unsafe fn run_avx512<K: Kernel>(kernel: K) -> K::Out {
+pub(super) unsafe fn run_avx512<K: Kernel>(kernel: &K) -> K::Out {
     // SAFETY: forwarded contract.
     unsafe { kernel.run::<Avx512>() }
 }
@@ -17,7 +17,7 @@ pub(super) unsafe fn run_avx512<K: Kernel>(kernel: K) -> K::Out {
 /// # Safety
 /// The CPU has AVX2 and FMA, and the kernel's contract holds.
 #[target_feature(enable = "avx2,fma")]
-pub(super) unsafe fn run_avx2<K: Kernel>(kernel: K) -> K::Out {
+pub(super) unsafe fn run_avx2<K: Kernel>(kernel: &K) -> K::Out {
     // SAFETY: forwarded contract.
     unsafe { kernel.run::<Avx2>() }
 }
