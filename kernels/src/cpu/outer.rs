@@ -71,10 +71,10 @@ impl Kernel for Outer {
     unsafe fn run<S: Simd>(&self) {
         // SAFETY: forwarded contract.
         unsafe {
-            if S::WIDE {
-                self.blocks::<S, 4>();
-            } else {
-                self.blocks::<S, 2>();
+            match S::REGISTERS {
+                32.. => self.blocks::<S, 4>(),
+                16.. => self.blocks::<S, 2>(),
+                _ => self.blocks::<S, 1>(),
             }
         }
     }

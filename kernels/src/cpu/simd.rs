@@ -12,8 +12,8 @@ use super::Isa;
 /// lanes that are accessed (no alignment is needed).
 pub(super) trait Simd {
     const LANES: usize;
-    /// Whether there are 32 vector registers rather than 16.
-    const WIDE: bool;
+    /// Vectors that fit into the registers at once.
+    const REGISTERS: usize;
     type V: Copy;
     /// One truth value per lane.
     type M: Copy;

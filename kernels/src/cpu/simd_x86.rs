@@ -68,7 +68,7 @@ impl Avx512 {
 
 impl Simd for Avx512 {
     const LANES: usize = 16;
-    const WIDE: bool = true;
+    const REGISTERS: usize = 32;
     type V = __m512;
     type M = __mmask16;
 
@@ -216,7 +216,7 @@ impl Avx2 {
 
 impl Simd for Avx2 {
     const LANES: usize = 8;
-    const WIDE: bool = false;
+    const REGISTERS: usize = 16;
     type V = __m256;
     /// All bits of a lane set or clear.
     type M = __m256;
