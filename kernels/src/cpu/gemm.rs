@@ -2,8 +2,8 @@
 //!
 //! The micro-kernel keeps an `MR` x `NV` block of accumulator vectors, `MR` outputs by `NV` vectors of rows, and per step
 //! of the contraction loads `NV` vectors of `x` and broadcasts `MR` weights; the fewer of them are kept in registers while
-//! the others pass. Row blocks are the outer loop, so that the
-//! slab of `x` that a block reads stays in the L1 cache while the panels stream through.
+//! the others pass. Row blocks are the outer loop, so that the slab of `x` that a block reads stays in the L1 cache while
+//! the panels stream through.
 use super::panels::{PANEL, panel_len};
 use super::simd::{Kernel, Simd, launch};
 use super::{Isa, ROW_BLOCK};
