@@ -1,9 +1,9 @@
 //! Matrix product of packed weights with a channel-major tile: `y = bias + W x`.
 //!
-//! The micro-kernel keeps an `MR` x `NV` block of accumulator vectors, `MR` outputs by `NV` vectors of rows, and per step
-//! of the contraction loads `NV` vectors of `x` and broadcasts `MR` weights; the fewer of them are kept in registers while
-//! the others pass. Row blocks are the outer loop, so that the slab of `x` that a block reads stays in the L1 cache while
-//! the panels stream through.
+//! The micro-kernel keeps an `MR` x `NV` block of accumulator vectors, `MR` outputs by `NV` vectors of rows, and per
+//! step of the contraction loads `NV` vectors of `x` and broadcasts `MR` weights; the fewer of them are kept in
+//! registers while the others pass. Row blocks are the outer loop, so that the slab of `x` that a block reads stays in
+//! the L1 cache while the panels stream through.
 use super::panels::{PANEL, panel_len};
 use super::simd::{Kernel, Simd, launch};
 use super::{Isa, ROW_BLOCK};
@@ -161,8 +161,8 @@ impl Gemm {
         }
     }
 
-    /// Applies the old `y` and the epilogue to the accumulators of a block. One loop per case, because the compiler keeps
-    /// accumulators in registers only in loops simple enough to be unrolled.
+    /// Applies the old `y` and the epilogue to the accumulators of a block. One loop per case, because the compiler
+    /// keeps accumulators in registers only in loops simple enough to be unrolled.
     ///
     /// # Safety
     /// As [`Gemm::block`].

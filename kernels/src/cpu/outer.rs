@@ -1,4 +1,4 @@
-//! Sum of outer products of two channel-major tiles, `g[k][n] += sum_r x[k][r] d[n][r]`: the gradient of a weight matrix.
+//! Sum of outer products of two channel-major tiles, `g[k][n] += sum_r x[k][r] d[n][r]`: the gradient of weights.
 //!
 //! The sum over rows runs inside vectors, so a 4x4 block of `g` takes 16 accumulator vectors, which a transposing tree
 //! reduces to the 16 sums at the end. `g` therefore lives in **blocks**, `[k / 4][n / 4][4][4]`: one cache line each.
@@ -38,8 +38,8 @@ pub fn outer_len(k: usize, n: usize) -> usize {
 /// Adds the outer products of all rows to `g`; the padding of edge blocks is left alone.
 ///
 /// # Safety
-/// `isa.supported()`. `rows` is a multiple of 16; the pointers are valid for the shapes given at the fields; `g` overlaps
-/// neither `x` nor `d`.
+/// `isa.supported()`. `rows` is a multiple of 16; the pointers are valid for the shapes given at the fields; `g`
+/// overlaps neither `x` nor `d`.
 pub unsafe fn outer(isa: Isa, args: Outer) {
     debug_assert_eq!(args.rows % 16, 0);
     // SAFETY: forwarded contract.

@@ -1,7 +1,7 @@
 //! Scalar primitives on runs of lanes: one call applies one [`Prim`] to `len` lanes.
 //!
-//! Every primitive is compiled for every combination of operand kinds, so that a call costs one dispatch and the loop has
-//! no branches.
+//! Every primitive is compiled for every combination of operand kinds, so that a call costs one dispatch and the loop
+//! has no branches.
 use super::Isa;
 use super::math;
 use super::simd::{Kernel, Simd, launch};
@@ -26,8 +26,8 @@ impl Operand {
 /// Computes `out[i] = prim(operands[0][i], ...)` for `len` lanes; operands beyond the primitive's arity are ignored.
 ///
 /// # Safety
-/// `isa.supported()`; `out` and the used operands are valid for `len` lanes; `out` equals an operand's pointer or does not
-/// overlap it.
+/// `isa.supported()`; `out` and the used operands are valid for `len` lanes; `out` equals an operand's pointer or does
+/// not overlap it.
 #[inline]
 pub unsafe fn apply(isa: Isa, prim: Prim, out: *mut f32, operands: [Operand; 3], len: usize) {
     // SAFETY: forwarded contract.
