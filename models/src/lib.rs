@@ -1,1 +1,4 @@
 //! raygrad: differentiable rendering.
+pub mod config;
+pub mod data;
+pub mod geometry;
