@@ -1,1 +1,78 @@
-//! raygrad's tests.
+//! What the tests share: seeded numbers, bindings, and the graph around an op under test.
+
+use raygrad_compiler::graph::{Axis, Shape, Tensor};
+use raygrad_compiler::ops::Sample;
+use raygrad_compiler::reference::{Array, Bindings};
+
+/// Seeded random numbers (splitmix64: Steele, Lea, Flood, Fast splittable pseudorandom number generators, 2014).
+pub struct Rng(pub u64);
+
+impl Rng {
+    pub fn bits(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        let z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        z ^ (z >> 31)
+    }
+    /// Uniform in `low..high`.
+    pub fn uniform(&mut self, low: f64, high: f64) -> f64 {
+        low + (high - low) * (self.bits() >> 11) as f64 * 2f64.powi(-53)
+    }
+    /// Uniform values for every lane of `shape`.
+    pub fn array(&mut self, shape: &Shape, low: f64, high: f64) -> Array {
+        Array::floats(shape, (0..shape.lanes()).map(|_| self.uniform(low, high)).collect())
+    }
+}
+
+/// A text's seed: tests keep their numbers when others are added.
+pub fn seed(text: &str) -> u64 {
+    text.bytes().fold(0xCBF2_9CE4_8422_2325, |h, b| (h ^ b as u64).wrapping_mul(0x0100_0000_01B3))
+}
+
+/// Sum over all axes and channels.
+pub fn total(t: &Tensor) -> Tensor {
+    t.sum_channels().sum_over(t.axes())
+}
+
+/// A sample's op in the middle of a graph: parameters `p0, p1, ..` pass through a smooth function into the sample's
+/// domain, the result is multiplied by the random `upstream`, passes through another one, and is summed.
+pub struct MidGraph {
+    pub parameters: Vec<Tensor>,
+    pub output: Tensor,
+    pub loss: Tensor,
+    pub bindings: Bindings,
+}
+
+impl MidGraph {
+    pub fn new(sample: &Sample) -> MidGraph {
+        let mut rng = Rng(seed(&sample.name));
+        let mut bindings = Bindings::new();
+        let (mut parameters, mut inputs) = (vec![], vec![]);
+        for (i, input) in sample.inputs.iter().enumerate() {
+            let name = format!("p{i}");
+            bindings.insert(name.clone(), rng.array(&input.shape, -1.2, 1.2));
+            let p = Tensor::parameter(name, input.shape.clone());
+            inputs.push(p.sin() * ((input.high - input.low) / 2.0) + (input.high + input.low) / 2.0);
+            parameters.push(p);
+        }
+        let output = (sample.build)(&inputs);
+        bindings.insert("upstream".into(), rng.array(output.shape(), -1.0, 1.0));
+        let upstream = Tensor::data("upstream", output.shape().clone());
+        let loss = total(&(&output * upstream).sin());
+        MidGraph { parameters, output, loss, bindings }
+    }
+}
+
+/// Largest difference between two slices, relative to the largest magnitude in `expected`, or to `floor` if that is more.
+pub fn worst(found: &[f64], expected: &[f64], floor: f64) -> f64 {
+    assert_eq!(found.len(), expected.len());
+    let scale = expected.iter().fold(floor, |m, x| m.max(x.abs()));
+    // A NaN anywhere must not pass: `max` would drop it.
+    let far = |(a, b): (&f64, &f64)| if (a - b).is_nan() { f64::INFINITY } else { (a - b).abs() };
+    found.iter().zip(expected).map(far).fold(0.0, f64::max) / scale
+}
+
+/// An array of the given axes and channels.
+pub fn floats(axes: &[&Axis], channels: usize, values: &[f64]) -> Array {
+    Array::floats(&Shape::new(axes, channels), values.to_vec())
+}

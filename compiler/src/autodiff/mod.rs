@@ -4,7 +4,6 @@
 //! all ops: a gradient is summed over the axes and channels that its operand lacks.
 
 use crate::graph::{Channels, Tensor, topological, with_source};
-use crate::ops::Op;
 use crate::scalar::DType;
 use std::collections::{HashMap, HashSet};
 

@@ -1,1 +1,2 @@
 //! Derived operations: plain functions of ops, with no rules of their own.
+pub mod matrix;

@@ -49,11 +49,7 @@ pub struct Shape {
 
 impl Shape {
     pub fn new(axes: &[&Axis], channels: impl Into<Channels>) -> Shape {
-        Shape {
-            axes: Axes::new(axes.iter().map(|a| (*a).clone())),
-            channels: channels.into(),
-            dtype: DType::F32,
-        }
+        Shape { axes: Axes::new(axes.iter().map(|a| (*a).clone())), channels: channels.into(), dtype: DType::F32 }
     }
     pub fn of(axes: Axes, channels: impl Into<Channels>, dtype: DType) -> Shape {
         Shape { axes, channels: channels.into(), dtype }

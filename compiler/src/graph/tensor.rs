@@ -71,7 +71,12 @@ impl Tensor {
 
     /// A tensor that only carries an error, for derived functions that check their arguments.
     #[track_caller]
-    pub fn misfit(name: &'static str, operands: &[&Tensor], problem: impl Into<String>, hint: impl Into<String>) -> Tensor {
+    pub fn misfit(
+        name: &'static str,
+        operands: &[&Tensor],
+        problem: impl Into<String>,
+        hint: impl Into<String>,
+    ) -> Tensor {
         Tensor::record(crate::ops::input::Refused { name, misfit: Misfit::new(problem, hint) }, operands)
     }
 
@@ -142,7 +147,10 @@ fn name_clash(op: &Arc<dyn Op>, inputs: &[Tensor], source: &'static Location<'st
                 } else {
                     format!("axis `{}` has size {} in one operand and {} in another", a.name(), b.size(), a.size())
                 };
-                let m = Misfit::new(problem, "make the axis once with Axis::new and clone it, or give the second another name");
+                let m = Misfit::new(
+                    problem,
+                    "make the axis once with Axis::new and clone it, or give the second another name",
+                );
                 return Some(Arc::new(record_error(op, inputs, m, source)));
             }
             Some(_) => {}

@@ -33,6 +33,16 @@ impl Op for ChannelSum {
         }
         vec![Some(g.channel_groups(back).reshape(inputs[0].channels()))]
     }
+    fn key(&self) -> String {
+        let mut hash = blake3::Hasher::new();
+        for group in self.0.iter() {
+            hash.update(&(group.len() as u32).to_le_bytes());
+            for c in group {
+                hash.update(&c.to_le_bytes());
+            }
+        }
+        format!("sum_channels {}", hash.finalize())
+    }
     fn flops(&self, _: &[Shape], _: &Shape) -> u64 {
         self.0.iter().map(|g| g.len() as u64).sum()
     }

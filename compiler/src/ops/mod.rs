@@ -38,7 +38,7 @@ pub trait Op: Any + Debug + Send + Sync {
         match self.form() {
             Form::Pointwise(p) => p.flops() * out.channels.count() as u64,
             Form::Linear { .. } => 2 * inputs[1].channels.count() as u64,
-            Form::Outer { .. } => 2 * out.channels.count() as u64,
+            Form::Outer => 2 * out.channels.count() as u64,
             Form::SymEig { n } => 60 * (n * n * n) as u64,
             _ => 0,
         }
@@ -97,10 +97,13 @@ pub enum Reduction {
 pub struct Sample {
     pub name: String,
     pub inputs: Vec<SampleInput>,
-    pub build: Box<dyn Fn(&[Tensor]) -> Tensor + Send + Sync>,
+    pub build: Build,
     /// Whether central differences make sense here (smooth on the domain).
     pub differentiable: bool,
 }
+
+/// Records the op on the sample's inputs.
+pub type Build = Box<dyn Fn(&[Tensor]) -> Tensor + Send + Sync>;
 
 /// An operand of a sample, drawn uniformly from `low..high`.
 pub struct SampleInput {
@@ -169,7 +172,45 @@ macro_rules! registry {
 }
 
 registry!(
-    input, constant, add, sub, mul, div, neg, min, max, compare, select, cast, relu, exp, floor, channel_sum, pick, identity,
-    linear, outer, reduce, index, cumsum, shift, take, scatter, sym_eig, integer, abs, log, sqrt, sin, cos, tanh, sigmoid,
-    softplus, gaussian, atan2, channel_max, custom, random
+    input,
+    constant,
+    add,
+    sub,
+    mul,
+    div,
+    neg,
+    min,
+    max,
+    compare,
+    select,
+    cast,
+    relu,
+    exp,
+    floor,
+    channel_sum,
+    pick,
+    identity,
+    linear,
+    outer,
+    reduce,
+    index,
+    cumsum,
+    shift,
+    take,
+    scatter,
+    sym_eig,
+    integer,
+    abs,
+    log,
+    sqrt,
+    sin,
+    cos,
+    tanh,
+    sigmoid,
+    softplus,
+    gaussian,
+    atan2,
+    channel_max,
+    custom,
+    random
 );

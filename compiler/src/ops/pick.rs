@@ -61,7 +61,8 @@ impl Op for Pick {
         (0..inputs.len()).map(adjoint).collect()
     }
     fn key(&self) -> String {
-        format!("pick {:?} {:?}", self.pick, self.channels)
+        let bytes: Vec<u8> = self.pick.iter().flat_map(|p| [p.0.to_le_bytes(), p.1.to_le_bytes()]).flatten().collect();
+        format!("pick {} {:?}", blake3::hash(&bytes), self.channels)
     }
 }
 

@@ -1,7 +1,7 @@
 //! What all pointwise ops share: broadcasting by name, evaluation lane by lane, lowering to a scalar program.
 
-use super::{Form, Op, common_channels, expect_dtype};
-use crate::graph::{Misfit, Shape, Tensor};
+use super::{Form, Op, Sample, SampleInput, common_channels, expect_dtype};
+use crate::graph::{Axis, Misfit, Shape, Tensor};
 use crate::reference::{Array, Lane};
 use crate::scalar::{DType, ScalarBuilder, ScalarProgram, Val};
 use std::fmt::Debug;
@@ -79,6 +79,32 @@ impl<P: Pointwise> Op for Map<P> {
     fn vjp(&self, inputs: &[Tensor], output: &Tensor, grad: &Tensor) -> Vec<Option<Tensor>> {
         self.0.vjp(inputs, output, grad)
     }
+}
+
+/// The sample of a function of one tensor, with arguments from `low..high`.
+pub(crate) fn unary(
+    name: impl Into<String>,
+    low: f64,
+    high: f64,
+    f: impl Fn(&Tensor) -> Tensor + Send + Sync + 'static,
+) -> Sample {
+    let row = Axis::new("row", 5);
+    Sample::new(name, vec![SampleInput::new(Shape::new(&[&row], 3), low, high)], move |x| f(&x[0]))
+}
+
+/// The sample of a function of two tensors that have one axis in common and one each of their own.
+pub(crate) fn binary(
+    name: impl Into<String>,
+    (low, high): (f64, f64),
+    (low2, high2): (f64, f64),
+    f: impl Fn(&Tensor, &Tensor) -> Tensor + Send + Sync + 'static,
+) -> Sample {
+    let (frame, row, column) = (Axis::new("frame", 2), Axis::new("row", 3), Axis::new("column", 4));
+    let inputs = vec![
+        SampleInput::new(Shape::new(&[&frame, &row], 3), low, high),
+        SampleInput::new(Shape::new(&[&frame, &column], 1), low2, high2),
+    ];
+    Sample::new(name, inputs, move |x| f(&x[0], &x[1]))
 }
 
 /// The `std::ops` operator of a pointwise op, between tensors by value or by reference and with numbers on either side.

@@ -49,8 +49,9 @@ impl Tensor {
 pub fn samples() -> Vec<Sample> {
     let (ray, sample) = (Axis::new("ray", 3), Axis::new("sample", 6));
     let x = || vec![SampleInput::new(Shape::new(&[&ray, &sample], 2), -1.0, 1.0)];
+    let (r, s) = (ray.clone(), sample.clone());
     vec![
-        Sample::new("shift", x(), move |x| x[0].shift(&sample, 2)),
-        Sample::new("shift back, outer axis", x(), move |x| x[0].shift(&ray, -1)),
+        Sample::new("shift", x(), move |x| x[0].shift(&s, 2)),
+        Sample::new("shift back, outer axis", x(), move |x| x[0].shift(&r, -1)),
     ]
 }

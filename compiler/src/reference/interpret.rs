@@ -10,17 +10,17 @@ pub type Bindings = HashMap<String, Array>;
 #[derive(Debug, thiserror::Error)]
 pub enum EvalError {
     #[error("{0}")]
-    Record(RecordError),
+    Record(Box<RecordError>),
     #[error("input `{name}` ({shape}) has no value")]
-    Unbound { name: String, shape: Shape },
+    Unbound { name: String, shape: Box<Shape> },
     #[error("input `{name}` is {expected}, but the value given is {found}")]
-    Shape { name: String, expected: Shape, found: Shape },
+    Shape { name: String, expected: Box<Shape>, found: Box<Shape> },
 }
 
 /// Values of `roots`, given the values of the inputs they depend on.
 pub fn evaluate(roots: &[Tensor], bindings: &Bindings) -> Result<Vec<Array>, EvalError> {
     if let Some(e) = roots.iter().find_map(Tensor::error) {
-        return Err(EvalError::Record(e.clone()));
+        return Err(EvalError::Record(Box::new(e.clone())));
     }
     let order = topological(roots.iter().cloned());
     let mut uses: HashMap<u64, usize> = HashMap::new();
@@ -50,9 +50,14 @@ pub fn evaluate(roots: &[Tensor], bindings: &Bindings) -> Result<Vec<Array>, Eva
 }
 
 fn bound(name: &str, shape: &Shape, bindings: &Bindings) -> Result<Array, EvalError> {
-    let value = bindings.get(name).ok_or_else(|| EvalError::Unbound { name: name.into(), shape: shape.clone() })?;
+    let value =
+        bindings.get(name).ok_or_else(|| EvalError::Unbound { name: name.into(), shape: Box::new(shape.clone()) })?;
     if value.shape != *shape {
-        return Err(EvalError::Shape { name: name.into(), expected: shape.clone(), found: value.shape.clone() });
+        return Err(EvalError::Shape {
+            name: name.into(),
+            expected: Box::new(shape.clone()),
+            found: Box::new(value.shape.clone()),
+        });
     }
     Ok(value.clone())
 }

@@ -5,5 +5,5 @@ mod check;
 mod interpret;
 
 pub use array::{Array, Data, Lane};
-pub use check::{central_difference, Direction};
+pub use check::{Direction, central_difference};
 pub use interpret::{Bindings, EvalError, evaluate};

@@ -1,0 +1,233 @@
+//! Domains, free values, forced cuts and depths.
+
+use super::{Target, TargetKind};
+use crate::graph::{Axes, Axis, Tensor, topological};
+use crate::ops::Form;
+use crate::plan::region::Grain;
+use std::collections::HashMap;
+
+/// Channels from which a pointwise value counts as wide on a GPU.
+const WIDE: usize = 65;
+
+/// The node whose lanes `t` has: reshapes, broadcasts and markers are seen through.
+pub(super) fn resolve(t: &Tensor) -> Tensor {
+    let mut t = t;
+    while t.op().form() == Form::Identity {
+        t = &t.inputs()[0];
+    }
+    t.clone()
+}
+
+/// What fusion knows of a node.
+pub(super) struct Info {
+    pub tensor: Tensor,
+    pub form: Form,
+    pub domain: Axes,
+    /// The axis its region's tiles run along.
+    pub inner: Option<Axis>,
+    pub grain: Grain,
+    /// Operands with identities seen through.
+    pub operands: Vec<Tensor>,
+    /// Its result is complete only when its region ends.
+    pub reduces: bool,
+    pub free: bool,
+    pub depth: usize,
+    /// Operations to compute one element from inputs and what is surely stored.
+    pub closure_flops: u64,
+}
+
+impl Info {
+    /// Regions are nodes of equal keys.
+    pub fn key(&self) -> Key {
+        Key { depth: self.depth, domain: self.domain.clone(), inner: self.inner.clone(), grain: self.grain }
+    }
+    /// Whether the weights of a layer (operand 1) are the same along the inner axis.
+    pub fn shared_weights(&self) -> bool {
+        matches!(self.form, Form::Linear { .. })
+            && self.inner.as_ref().is_none_or(|i| !self.operands[1].axes().contains(i))
+    }
+    /// Whether operand `i` must be a buffer, not a value of the region.
+    pub fn needs_buffer(&self, i: usize) -> bool {
+        match self.form {
+            Form::Linear { .. } => i == 1 && self.shared_weights(),
+            Form::Take { .. } => i == 0,
+            _ => false,
+        }
+    }
+}
+
+#[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub(super) struct Key {
+    pub depth: usize,
+    pub domain: Axes,
+    pub inner: Option<Axis>,
+    pub grain: Grain,
+}
+
+pub(super) struct Cuts {
+    pub nodes: HashMap<u64, Info>,
+    /// Identifiers in topological order.
+    pub order: Vec<u64>,
+    pub target: Target,
+}
+
+impl Cuts {
+    pub fn new(roots: &[Tensor], target: Target) -> Cuts {
+        let mut cuts = Cuts { nodes: HashMap::new(), order: vec![], target };
+        let is_root = |t: &Tensor| roots.iter().any(|r| r.id() == t.id());
+        for t in topological(roots.iter().cloned()) {
+            // An identity is a node only if it must be written as such.
+            if t.op().form() != Form::Identity || is_root(&t) {
+                let info = cuts.inspect(&t);
+                cuts.order.push(t.id());
+                cuts.nodes.insert(t.id(), info);
+            }
+        }
+        cuts.sink(roots);
+        cuts
+    }
+
+    pub fn get(&self, t: &Tensor) -> &Info {
+        &self.nodes[&t.id()]
+    }
+
+    fn inspect(&self, t: &Tensor) -> Info {
+        let form = t.op().form();
+        let operands: Vec<Tensor> = t.inputs().iter().map(resolve).collect();
+        let mut domain = t.axes().clone();
+        let mut reduces = false;
+        if matches!(form, Form::Reduce(_) | Form::Outer | Form::Scatter { .. }) {
+            domain = t.inputs().iter().fold(Axes::none(), |d, i| d.union(i.axes()));
+            reduces = !(form == Form::Outer && domain == *t.axes());
+        }
+        let mut inner = domain.last().cloned();
+        if let Form::CumSum { axis, .. } | Form::Shift { axis, .. } = &form {
+            inner = Some(axis.clone());
+        }
+        let mut info = Info {
+            tensor: t.clone(),
+            form,
+            domain,
+            inner,
+            grain: Grain::Row,
+            operands,
+            reduces,
+            free: false,
+            depth: 0,
+            closure_flops: 0,
+        };
+        info.grain = self.grain(&info);
+        let shapes: Vec<_> = info.operands.iter().map(|o| o.shape().clone()).collect();
+        let own = t.op().flops(&shapes, t.shape());
+        let computed = |o: &&Tensor| !self.get(o).reduces;
+        info.closure_flops = info
+            .operands
+            .iter()
+            .filter(computed)
+            .map(|o| self.get(o).closure_flops)
+            .fold(own, |a, b| a.saturating_add(b));
+        info.free = match &info.form {
+            Form::Input | Form::Const(_) | Form::Index { .. } => true,
+            Form::Take { .. } => {
+                matches!(self.get(&info.operands[0]).form, Form::Input) && self.get(&info.operands[1]).free
+            }
+            Form::Pointwise(_) | Form::Pick(_) | Form::ChannelSum(_) | Form::Identity => {
+                info.operands.iter().all(|o| self.get(o).free)
+            }
+            _ => false,
+        } && (info.closure_flops <= self.target.free_flops || matches!(info.form, Form::Pick(_)))
+            && (0..info.operands.len()).all(|i| !self.stored_for(&info, i) || info.needs_buffer(i));
+        info.depth = (0..info.operands.len())
+            .map(|i| {
+                let operand = self.get(&info.operands[i]);
+                let stored = self.stored_for(&info, i);
+                operand.depth + usize::from(stored && operand.form != Form::Input)
+            })
+            .max()
+            .unwrap_or(0);
+        if info.free {
+            info.depth = 0;
+        }
+        info
+    }
+
+    /// GPU: wide pointwise values and layers work lane by lane, everything else row by row.
+    fn grain(&self, info: &Info) -> Grain {
+        let wide = match &info.form {
+            Form::Linear { .. } => info.shared_weights(),
+            Form::Pointwise(_) | Form::Const(_) => info.tensor.width() >= WIDE,
+            Form::Pick(_) => info.tensor.width() >= WIDE,
+            Form::Identity => info.tensor.width() >= WIDE,
+            Form::Reduce(_) => info.tensor.width() >= WIDE,
+            _ => false,
+        };
+        if wide && self.target.kind == TargetKind::Gpu { Grain::Lane } else { Grain::Row }
+    }
+
+    /// Whether operand `i` of a node reaches it through memory. Free values are computed in place unless a buffer is needed.
+    pub fn stored_for(&self, user: &Info, i: usize) -> bool {
+        let operand = self.get(&user.operands[i]);
+        if user.needs_buffer(i) {
+            return !self.is_view(&user.operands[i]);
+        }
+        let gpu = self.target.kind == TargetKind::Gpu;
+        let layer = matches!(user.form, Form::Linear { .. }) && user.shared_weights();
+        if gpu && (layer || user.form == Form::Outer && user.reduces) {
+            return true;
+        }
+        if gpu && user.grain == Grain::Lane && operand.tensor.width() > 1 && operand.grain == Grain::Row {
+            return true;
+        }
+        if operand.free {
+            return false;
+        }
+        operand.reduces || operand.domain != user.domain || operand.inner != user.inner || operand.grain != user.grain
+    }
+
+    /// Weights that are consecutive channels of an input need no copy.
+    pub fn is_view(&self, t: &Tensor) -> bool {
+        view(t).is_some_and(|(buffer, _)| self.get(&buffer).form == Form::Input)
+    }
+
+    /// Moves nodes as late as their users in the same region allow, and updates (which nobody waits for) to the last one.
+    fn sink(&mut self, roots: &[Tensor]) {
+        let mut users: HashMap<u64, Vec<(u64, usize)>> = HashMap::new();
+        for id in &self.order {
+            for (i, o) in self.nodes[id].operands.iter().enumerate() {
+                users.entry(o.id()).or_default().push((*id, i));
+            }
+        }
+        let last =
+            roots.iter().map(|r| self.get(r)).filter(|i| i.domain.is_empty()).map(|i| i.depth).max().unwrap_or(0);
+        for id in self.order.clone().into_iter().rev() {
+            let info = &self.nodes[&id];
+            if info.free || info.reduces {
+                continue;
+            }
+            let users = users.get(&id).map_or(&[][..], |u| u);
+            let in_place = users.iter().all(|(u, i)| {
+                let user = &self.nodes[u];
+                !user.free && !self.stored_for(user, *i)
+            });
+            let is_root = roots.iter().any(|r| r.id() == id);
+            let earliest = users.iter().map(|(u, _)| self.nodes[u].depth).min();
+            let depth = match earliest {
+                Some(d) if in_place && !is_root => d.max(info.depth),
+                None if is_root && info.domain.is_empty() => last.max(info.depth),
+                Some(d) if in_place && is_root && info.domain.is_empty() => d.max(info.depth),
+                _ => info.depth,
+            };
+            if let Some(info) = self.nodes.get_mut(&id) {
+                info.depth = depth;
+            }
+        }
+    }
+}
+
+/// The tensor of which `t` is a range of consecutive channels, and the first of them.
+pub(super) fn view(t: &Tensor) -> Option<(Tensor, usize)> {
+    let Form::Pick(pick) = t.op().form() else { return Some((t.clone(), 0)) };
+    let first = pick.first()?.1;
+    let consecutive = pick.iter().enumerate().all(|(i, p)| p.0 == pick[0].0 && p.1 == first + i as u32);
+    consecutive.then(|| (resolve(&t.inputs()[pick[0].0 as usize]), first as usize))
+}

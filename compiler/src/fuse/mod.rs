@@ -1,0 +1,44 @@
+//! Fusion: which ops share a launch, and what is written to memory between launches.
+//!
+//! A node's *domain* is the set of axes it loops over, its *depth* the number of cuts on the longest path to it. A cut is
+//! forced where a value must be complete before it is used: after a reduction, before a gather's table or a layer's
+//! weights, between domains, and, on a GPU, around wide layers. Nodes of one depth and domain form one region. Values
+//! that are cheap to get from inputs are *free*: every region that needs them computes them itself.
+//!
+//! What a region needs from an earlier region of the same domain is either stored or computed again: narrow expensive
+//! values are stored, wide ones recomputed (see [`Target::store_channels`]).
+
+mod build;
+mod cuts;
+mod merge;
+
+pub use build::{Fused, Origin, fuse};
+
+/// What fusion decides by.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Target {
+    pub kind: TargetKind,
+    /// A value needed by a later region of the same domain is stored if it has at most this many channels, else recomputed.
+    pub store_channels: usize,
+    /// Operations per channel up to which a value is computed again rather than stored.
+    pub recompute_flops: u64,
+    /// Operations per element up to which values computed from inputs alone are free.
+    pub free_flops: u64,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TargetKind {
+    /// Resident tiles: a region holds any number of layers.
+    Cpu,
+    /// Layered: a region holds the layers of one depth and their pointwise epilogues.
+    Gpu,
+}
+
+impl Target {
+    pub fn cpu() -> Target {
+        Target { kind: TargetKind::Cpu, store_channels: 32, recompute_flops: 64, free_flops: 600 }
+    }
+    pub fn gpu() -> Target {
+        Target { kind: TargetKind::Gpu, store_channels: usize::MAX, recompute_flops: 16, free_flops: 600 }
+    }
+}

@@ -1,0 +1,49 @@
+//! Maximum over the channels; its gradient is shared equally between ties.
+
+use super::{Form, Op, Sample, expect_dtype, pointwise::unary};
+use crate::graph::{Channels, Misfit, Shape, Tensor};
+use crate::reference::{Array, Lane};
+use crate::scalar::DType;
+
+#[derive(Clone, Debug)]
+pub struct ChannelMax;
+
+impl Op for ChannelMax {
+    fn name(&self) -> &'static str {
+        "max_channels"
+    }
+    fn shape(&self, inputs: &[Shape]) -> Result<Shape, Misfit> {
+        expect_dtype(&inputs[0], DType::F32, 0)?;
+        Ok(inputs[0].clone().with_channels(Channels::Vector(1)))
+    }
+    fn form(&self) -> Form {
+        Form::ChannelMax
+    }
+    fn eval(&self, inputs: &[&Array], out: &Shape) -> Array {
+        let channels = inputs[0].shape.channels.count();
+        Array::from_fn(out, |e, _| {
+            let lanes = (0..channels).map(|c| inputs[0].at(e, c).f());
+            Lane::F(lanes.fold(f64::NEG_INFINITY, |a, b| if a > b { a } else { b }))
+        })
+    }
+    fn vjp(&self, inputs: &[Tensor], output: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
+        let hit = inputs[0].equal(output).to_f32();
+        let ties = hit.sum_channels();
+        vec![Some(hit * (g / ties))]
+    }
+    fn flops(&self, inputs: &[Shape], _: &Shape) -> u64 {
+        inputs[0].channels.count() as u64
+    }
+}
+
+impl Tensor {
+    /// Maximum over all channels.
+    #[track_caller]
+    pub fn max_channels(&self) -> Tensor {
+        Tensor::record(ChannelMax, &[self])
+    }
+}
+
+pub fn samples() -> Vec<Sample> {
+    vec![unary("max_channels", -1.0, 1.0, Tensor::max_channels)]
+}

@@ -1,0 +1,40 @@
+//! Natural logarithm; `y' = 1 / x`.
+
+use super::pointwise::unary;
+use super::{Pointwise, Sample, map};
+use crate::graph::Tensor;
+use crate::reference::Lane;
+use crate::scalar::{DType, Prim, ScalarBuilder, Val};
+
+#[derive(Clone, Debug)]
+pub struct Log;
+
+impl Pointwise for Log {
+    fn name(&self) -> &'static str {
+        "log"
+    }
+    fn operands(&self) -> &'static [Option<DType>] {
+        &[Some(DType::F32)]
+    }
+    fn eval(&self, a: &[Lane]) -> Lane {
+        Lane::F(a[0].f().ln())
+    }
+    fn vjp(&self, x: &[Tensor], _: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
+        vec![Some(g / &x[0])]
+    }
+    fn lower(&self, b: &mut ScalarBuilder, a: &[Val]) -> Val {
+        b.emit(Prim::Log, a)
+    }
+}
+
+impl Tensor {
+    /// Natural logarithm.
+    #[track_caller]
+    pub fn log(&self) -> Tensor {
+        map(Log, &[self])
+    }
+}
+
+pub fn samples() -> Vec<Sample> {
+    vec![unary("log", 0.5, 2.0, Tensor::log)]
+}

@@ -1,0 +1,111 @@
+//! The page `explain` prints: every launch with what is fused, stored, recomputed, FLOPs and bytes.
+
+use super::region::{Region, RegionOp, Store};
+use super::{BufferKind, Program};
+use std::collections::BTreeMap;
+use std::fmt;
+
+/// A name that says what dominates the launch: `03_frame.pixel_linear`.
+pub(super) fn launch_name(index: usize, region: &Region) -> String {
+    let axes: Vec<&str> = region.domain.iter().map(|a| a.name()).collect();
+    let domain = if axes.is_empty() { "once".to_string() } else { axes.join(".") };
+    let kind = |op: &RegionOp| match op {
+        RegionOp::Linear(_) | RegionOp::RowLinear { .. } => 5,
+        RegionOp::SymEig { .. } => 4,
+        RegionOp::CumSum { .. } | RegionOp::Shift { .. } => 3,
+        RegionOp::Map(_) => 2,
+        _ => 1,
+    };
+    let main = match region.body.iter().map(|i| kind(&i.op)).max() {
+        Some(5) => "layers",
+        Some(4) => "eigen",
+        Some(3) => "scan",
+        Some(2) => "map",
+        _ => "copy",
+    };
+    let reduces = region.stores.iter().any(|s| !matches!(s, Store::Write { .. }));
+    format!("{index:02}_{domain}_{main}{}", if reduces { "_reduce" } else { "" })
+}
+
+impl Program {
+    /// Bytes a launch moves to and from memory: every buffer it touches, once.
+    pub fn launch_bytes(&self, index: usize) -> u64 {
+        let region = &self.launches[index].region;
+        let written = region.stores.iter().map(|s| s.buffer());
+        region.reads().into_iter().chain(written).map(|b| 4 * self.buffer(b).shape.lanes() as u64).sum()
+    }
+
+    /// Bytes of all buffers, temporaries of one slot counted once.
+    pub fn memory_bytes(&self) -> u64 {
+        let own = self.buffers.iter().filter(|b| !matches!(b.kind, BufferKind::Temporary { .. }));
+        4 * (own.map(|b| b.shape.lanes()).sum::<usize>() + self.slots.iter().sum::<usize>()) as u64
+    }
+}
+
+impl fmt::Display for Program {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        writeln!(
+            f,
+            "{} launches from {} recorded ops, {:.3} GFLOP, {:.2} MB in buffers, target {:?}",
+            self.launches.len(),
+            self.ops,
+            self.flops() as f64 * 1e-9,
+            self.memory_bytes() as f64 * 1e-6,
+            self.target.kind,
+        )?;
+        for (i, launch) in self.launches.iter().enumerate() {
+            let region = &launch.region;
+            writeln!(f, "\n{}  over {}", launch.name, region.domain)?;
+            writeln!(f, "  {:.3} MFLOP, {:.3} MB", region.flops() as f64 * 1e-6, self.launch_bytes(i) as f64 * 1e-6)?;
+            writeln!(f, "  fused: {}", fused(region))?;
+            if launch.recomputed > 0 {
+                writeln!(f, "  recomputed: {} values of earlier launches", launch.recomputed)?;
+            }
+            for b in region.reads() {
+                writeln!(f, "  reads   b{} {}", b.0, self.describe(b))?;
+            }
+            for s in &region.stores {
+                let how = match s {
+                    Store::Write { .. } => "writes ",
+                    Store::Reduce { kind: crate::ops::Reduction::Sum, .. } => "sums   ",
+                    Store::Reduce { kind: crate::ops::Reduction::Max, .. } => "maxima ",
+                    Store::Outer { .. } => "outer  ",
+                    Store::Scatter { .. } => "scatter",
+                };
+                writeln!(f, "  {how} b{} {}", s.buffer().0, self.describe(s.buffer()))?;
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Program {
+    fn describe(&self, id: super::BufferId) -> String {
+        let b = self.buffer(id);
+        let kind = match &b.kind {
+            BufferKind::Input { role, .. } => format!("{role:?}").to_lowercase(),
+            BufferKind::Temporary { slot } => format!("slot {slot}"),
+            BufferKind::Output => "output".into(),
+        };
+        format!("{} ({}, {kind})", b.label, b.shape)
+    }
+}
+
+/// The region's instructions, counted by name in order of first appearance.
+fn fused(region: &Region) -> String {
+    let mut order: Vec<String> = vec![];
+    let mut count: BTreeMap<String, usize> = BTreeMap::new();
+    for inst in &region.body {
+        let name = match &inst.op {
+            RegionOp::Load(_) | RegionOp::Const(_) => continue,
+            RegionOp::Linear(w) => format!("{}({}x{})", inst.label, w.rows, w.columns),
+            _ => inst.label.clone(),
+        };
+        if !count.contains_key(&name) {
+            order.push(name.clone());
+        }
+        *count.entry(name).or_default() += 1;
+    }
+    let list = order.iter().map(|n| if count[n] > 1 { format!("{n} x{}", count[n]) } else { n.clone() });
+    list.collect::<Vec<_>>().join(", ")
+}

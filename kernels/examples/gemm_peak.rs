@@ -1,0 +1,110 @@
+//! Speed of the CPU kernels on one thread: matrix kernels in per cent of the multiply-add peak that is measured right
+//! before and after, functions in nanoseconds per value.
+//!
+//! `cargo run --release -p raygrad-kernels --example gemm_peak [-- <seconds per case> <instruction set>]`
+use raygrad_compiler::scalar::Prim;
+use raygrad_kernels::cpu::*;
+use std::time::Instant;
+
+/// Weight matrices that take turns, so that none stays in the L1 cache.
+const SETS: usize = 4;
+
+/// Seconds per call of `f`, averaged over about `seconds`.
+fn time(seconds: f64, mut f: impl FnMut(usize)) -> f64 {
+    (0..SETS).for_each(&mut f);
+    let start = Instant::now();
+    let mut calls = 0;
+    while start.elapsed().as_secs_f64() < seconds {
+        for _ in 0..2 * SETS {
+            f(calls);
+            calls += 1;
+        }
+    }
+    start.elapsed().as_secs_f64() / calls as f64
+}
+
+/// Prints quartiles of many short measurements, each relative to the peak right before and after it.
+fn report(name: &str, flops: f64, seconds: f64, mut f: impl FnMut(usize)) {
+    const WINDOWS: usize = 41;
+    let mut before = peak_gflops(1, 1.0);
+    let mut percent: Vec<f64> = (0..WINDOWS)
+        .map(|_| {
+            let rate = flops / time(seconds / WINDOWS as f64, &mut f) * 1e-9;
+            let after = peak_gflops(1, 1.0);
+            rate / (0.5 * (std::mem::replace(&mut before, after) + after)) * 100.0
+        })
+        .collect();
+    percent.sort_by(f64::total_cmp);
+    let [low, median, high] = [1, 2, 3].map(|q| percent[WINDOWS * q / 4]);
+    println!("{name:36} {median:6.1} % of peak (quartiles {low:.1} .. {high:.1})");
+}
+
+fn filled(len: usize) -> AlignedVec {
+    let mut v = AlignedVec::zeroed(len);
+    v.iter_mut().enumerate().for_each(|(i, x)| *x = ((i * 37 % 101) as f32 - 50.0) * 0.01);
+    v
+}
+
+fn matrix_kernels(isa: Isa, k: usize, n: usize, rows: usize, seconds: f64) {
+    let ld = row_stride(rows);
+    let (x, mut y, bias) = (filled(k * ld), filled(n * ld), filled(n));
+    let panels = filled(panel_len(k, n) * SETS);
+    let flops = 2.0 * (k * n * rows) as f64;
+    report(&format!("{isa} gemm {k}x{n}, {rows} rows"), flops, seconds, |i| {
+        let args = Gemm {
+            x: x.as_ptr(),
+            ldx: ld,
+            contraction: k,
+            panels: panels[i % SETS * panel_len(k, n)..].as_ptr(),
+            outputs: n,
+            bias: bias.as_ptr(),
+            accumulate: false,
+            epilogue: Epilogue::Relu,
+            y: y.as_mut_ptr(),
+            ldy: ld,
+            rows,
+        };
+        // SAFETY: `isa` is available, and the buffers have the shapes given.
+        unsafe { gemm(isa, args) }
+    });
+    let mut g = AlignedVec::zeroed(outer_len(k, n) * SETS);
+    report(&format!("{isa} outer {k}x{n}, {rows} rows"), flops, seconds, |i| {
+        let g = g[i % SETS * outer_len(k, n)..].as_mut_ptr();
+        let args = Outer { x: x.as_ptr(), ldx: ld, k, d: y.as_ptr(), ldd: ld, n, rows, g };
+        // SAFETY: as above.
+        unsafe { outer(isa, args) }
+    });
+    let mut sums = vec![0.0; k];
+    let each = time(seconds, |_| {
+        // SAFETY: as above.
+        unsafe { rows_sum(isa, x.as_ptr(), ld, k, rows, sums.as_mut_ptr()) }
+    });
+    println!("{isa} rows_sum {k} channels, {rows} rows: {:.3} ns/value", each * 1e9 / (k * rows) as f64);
+}
+
+fn functions(isa: Isa, seconds: f64) {
+    const LEN: usize = 1024;
+    let (a, b) = (filled(LEN), filled(LEN));
+    let mut out = AlignedVec::zeroed(LEN);
+    print!("{isa} ns/value:");
+    use Prim::*;
+    for prim in [Exp, Log, Sin, Cos, Tanh, Atan2, Add, Div, Sqrt, ToU32] {
+        let operands = [Operand::Lanes(a.as_ptr()), Operand::Lanes(b.as_ptr()), Operand::Splat(0)];
+        // SAFETY: all runs have `LEN` lanes.
+        let each = time(seconds * 0.1, |_| unsafe { apply(isa, prim, out.as_mut_ptr(), operands, LEN) });
+        print!(" {prim:?} {:.3}", each * 1e9 / LEN as f64);
+    }
+    println!();
+}
+
+fn main() {
+    let seconds = std::env::args().nth(1).and_then(|s| s.parse().ok()).unwrap_or(0.15);
+    println!("peak of one thread: {:.1} GFLOP/s ({})", peak_gflops(1, 200.0), Isa::detect());
+    let only = std::env::args().nth(2);
+    for isa in Isa::available().into_iter().filter(|isa| only.as_ref().is_none_or(|name| isa.to_string() == *name)) {
+        for (k, n, rows) in [(256, 256, 192), (256, 256, 96), (34, 256, 192), (64, 64, 192), (256, 3, 192)] {
+            matrix_kernels(isa, k, n, rows, seconds);
+        }
+        functions(isa, seconds);
+    }
+}

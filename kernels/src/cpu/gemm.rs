@@ -1,0 +1,195 @@
+//! Matrix product of packed weights with a channel-major tile: `y = bias + W x`.
+//!
+//! The micro-kernel keeps an `MR` x `NV` block of accumulator vectors, `MR` outputs by `NV` vectors of rows, and per step
+//! of the contraction loads `NV` vectors of `x` and broadcasts `MR` weights. Row blocks are the outer loop, so that the
+//! slab of `x` that a block reads stays in the L1 cache while the panels stream through.
+use super::panels::{PANEL, panel_len};
+use super::simd::{Kernel, Simd, launch};
+use super::{Isa, ROW_BLOCK};
+
+/// What happens to a finished output.
+#[derive(Clone, Copy, Debug)]
+pub enum Epilogue {
+    None,
+    /// `max(y, 0)`.
+    Relu,
+    /// `y` where `h > 0`, else 0: the derivative of a rectifier whose output is `h`. `h` may be `y` itself.
+    Mask {
+        h: *const f32,
+        ldh: usize,
+    },
+}
+
+/// Operands of [`gemm`]: `y[o][r] = epilogue(bias[o] + sum_c w[o][c] x[c][r])`, or `+=` instead of `=`.
+#[derive(Clone, Copy, Debug)]
+pub struct Gemm {
+    /// `[contraction][rows]`, row stride `ldx`.
+    pub x: *const f32,
+    pub ldx: usize,
+    pub contraction: usize,
+    /// Packed by [`super::pack_panels`].
+    pub panels: *const f32,
+    pub outputs: usize,
+    /// One value per output, or null for zeros.
+    pub bias: *const f32,
+    /// Adds the old `y` before the epilogue.
+    pub accumulate: bool,
+    pub epilogue: Epilogue,
+    /// `[outputs][rows]`, row stride `ldy`.
+    pub y: *mut f32,
+    pub ldy: usize,
+    /// A multiple of [`ROW_BLOCK`].
+    pub rows: usize,
+}
+
+/// Computes the product.
+///
+/// # Safety
+/// `isa.supported()`. `rows` is a multiple of [`ROW_BLOCK`]; the pointers are valid for the shapes given at the fields;
+/// `y` overlaps no operand, except that `h` of the epilogue may equal `y` with `ldh == ldy`.
+pub unsafe fn gemm(isa: Isa, args: Gemm) {
+    debug_assert_eq!(args.rows % ROW_BLOCK, 0);
+    // SAFETY: forwarded contract.
+    unsafe { launch(isa, args) }
+}
+
+impl Kernel for Gemm {
+    type Out = ();
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) {
+        // SAFETY: forwarded contract. `NV * LANES` divides `ROW_BLOCK`.
+        unsafe {
+            if S::WIDE {
+                const { assert!(!S::WIDE || ROW_BLOCK.is_multiple_of(2 * S::LANES)) };
+                self.blocks::<S, 8, 2>();
+            } else {
+                const { assert!(ROW_BLOCK.is_multiple_of(2 * S::LANES)) };
+                self.blocks::<S, 4, 2>();
+            }
+        }
+    }
+}
+
+impl Gemm {
+    /// All blocks of `MR` outputs and `NV` vectors.
+    ///
+    /// # Safety
+    /// As [`gemm`], and `NV * S::LANES` divides `rows`, `MR` divides [`PANEL`].
+    #[inline(always)]
+    unsafe fn blocks<S: Simd, const MR: usize, const NV: usize>(&self) {
+        let panel_size = panel_len(self.contraction, PANEL);
+        let mut row = 0;
+        while row < self.rows {
+            let mut output = 0;
+            while output < self.outputs {
+                let count = MR.min(self.outputs - output);
+                // SAFETY: `output < outputs`, so that its panel exists; each block has `count` outputs left, and
+                // `row + NV * LANES <= rows` since the block height divides `rows`.
+                unsafe {
+                    let panel = self.panels.add(output / PANEL * panel_size + output % PANEL);
+                    match count {
+                        1 => self.block::<S, 1, NV>(panel, output, row),
+                        2 => self.block::<S, 2, NV>(panel, output, row),
+                        3 => self.block::<S, 3, NV>(panel, output, row),
+                        // A count below `MR` here means `MR == 8`.
+                        4 if MR > 4 => self.block::<S, 4, NV>(panel, output, row),
+                        5 if MR > 4 => self.block::<S, 5, NV>(panel, output, row),
+                        6 if MR > 4 => self.block::<S, 6, NV>(panel, output, row),
+                        7 if MR > 4 => self.block::<S, 7, NV>(panel, output, row),
+                        _ => self.block::<S, MR, NV>(panel, output, row),
+                    }
+                }
+                output += count;
+            }
+            row += NV * S::LANES;
+        }
+    }
+
+    /// One block: outputs `output..output + MR` of rows `row..row + NV * S::LANES`.
+    ///
+    /// # Safety
+    /// As [`gemm`]; the block lies inside `y`, and `panel` points to the weights of its first output.
+    #[inline(always)]
+    unsafe fn block<S: Simd, const MR: usize, const NV: usize>(&self, panel: *const f32, output: usize, row: usize) {
+        // SAFETY: every access is channel `< contraction` of `x`, or output `output + i` of `bias`, `y` and `h`, at
+        // vector `j` of the block's rows: inside by the contract. `panel + c * PANEL + i` stays in the panel because
+        // `output % PANEL + MR <= PANEL`.
+        unsafe {
+            let zero = S::splat(0.0);
+            let mut acc = [[zero; NV]; MR];
+            if !self.bias.is_null() {
+                for i in 0..MR {
+                    acc[i] = [S::splat(*self.bias.add(output + i)); NV];
+                }
+            }
+            let mut x = self.x.add(row);
+            let mut weights = panel;
+            for _ in 0..self.contraction {
+                let mut xs = [zero; NV];
+                for j in 0..NV {
+                    xs[j] = S::load(x.add(j * S::LANES));
+                }
+                for i in 0..MR {
+                    let w = S::splat(*weights.add(i));
+                    for j in 0..NV {
+                        acc[i][j] = S::fma(w, xs[j], acc[i][j]);
+                    }
+                }
+                // `wrapping_add`: after the last step the pointer may lie beyond the end of the tile.
+                x = x.wrapping_add(self.ldx);
+                weights = weights.wrapping_add(PANEL);
+            }
+            self.finish::<S, MR, NV>(&mut acc, output, row);
+            for i in 0..MR {
+                for j in 0..NV {
+                    S::store(self.y.add((output + i) * self.ldy + row + j * S::LANES), acc[i][j]);
+                }
+            }
+        }
+    }
+
+    /// Applies the old `y` and the epilogue to the accumulators of a block. One loop per case, because the compiler keeps
+    /// accumulators in registers only in loops simple enough to be unrolled.
+    ///
+    /// # Safety
+    /// As [`Gemm::block`].
+    #[inline(always)]
+    unsafe fn finish<S: Simd, const MR: usize, const NV: usize>(
+        &self,
+        acc: &mut [[S::V; NV]; MR],
+        output: usize,
+        row: usize,
+    ) {
+        // SAFETY: the block lies inside `y` and `h`.
+        unsafe {
+            if self.accumulate {
+                for i in 0..MR {
+                    for j in 0..NV {
+                        let y = self.y.add((output + i) * self.ldy + row + j * S::LANES);
+                        acc[i][j] = S::add(S::load(y), acc[i][j]);
+                    }
+                }
+            }
+            let zero = S::splat(0.0);
+            match self.epilogue {
+                Epilogue::None => {}
+                Epilogue::Relu => {
+                    for i in 0..MR {
+                        for j in 0..NV {
+                            acc[i][j] = S::max(acc[i][j], zero);
+                        }
+                    }
+                }
+                Epilogue::Mask { h, ldh } => {
+                    for i in 0..MR {
+                        for j in 0..NV {
+                            let active = S::lt(zero, S::load(h.add((output + i) * ldh + row + j * S::LANES)));
+                            acc[i][j] = S::select(active, acc[i][j], zero);
+                        }
+                    }
+                }
+            }
+        }
+    }
+}

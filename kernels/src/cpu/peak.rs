@@ -1,0 +1,83 @@
+//! The multiply-add peak of this machine, to which kernel speeds are compared.
+use super::Isa;
+use super::simd::{Kernel, Simd, launch};
+use std::hint::black_box;
+use std::time::{Duration, Instant};
+
+/// Independent multiply-add chains: more than latency times throughput of any current core, and with the two factors
+/// still within 16 or 32 registers.
+const CHAINS_WIDE: usize = 20;
+const CHAINS_NARROW: usize = 12;
+/// Multiply-adds of each chain between two looks at the clock.
+const STEPS: usize = 20_000;
+
+/// GFLOP/s (a multiply-add counts twice) of `threads` threads that do nothing but multiply-adds for `ms` milliseconds,
+/// with the best instruction set.
+pub fn peak_gflops(threads: usize, ms: f64) -> f64 {
+    let isa = Isa::detect();
+    let limit = Duration::from_secs_f64(ms * 1e-3);
+    std::thread::scope(|scope| {
+        let others: Vec<_> = (1..threads).map(|_| scope.spawn(move || rate(isa, limit))).collect();
+        let own = rate(isa, limit);
+        own + others.into_iter().map(|t| t.join().expect("a measuring thread panicked")).sum::<f64>()
+    })
+}
+
+/// GFLOP/s of the calling thread.
+fn rate(isa: Isa, limit: Duration) -> f64 {
+    let start = Instant::now();
+    let mut flops = 0.0;
+    loop {
+        // SAFETY: `isa` was detected, and the kernel touches no memory.
+        flops += unsafe { launch(isa, Chains) };
+        let elapsed = start.elapsed();
+        if elapsed >= limit {
+            return flops / elapsed.as_secs_f64() * 1e-9;
+        }
+    }
+}
+
+/// Runs [`STEPS`] multiply-adds in every chain and returns the number of operations.
+struct Chains;
+
+impl Kernel for Chains {
+    type Out = f64;
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(self) -> f64 {
+        // SAFETY: forwarded contract.
+        unsafe { if S::WIDE { chains::<S, CHAINS_WIDE>() } else { chains::<S, CHAINS_NARROW>() } }
+    }
+}
+
+/// # Safety
+/// The CPU has the instruction set of `S`.
+#[inline(always)]
+unsafe fn chains<S: Simd, const N: usize>() -> f64 {
+    // SAFETY: register operations of an instruction set that the caller vouches for.
+    unsafe {
+        let (a, b) = (S::splat(black_box(0.5)), S::splat(black_box(1.0)));
+        let mut acc = [S::splat(black_box(0.0)); N];
+        for _ in 0..STEPS {
+            for v in &mut acc {
+                *v = S::fma(*v, a, b);
+            }
+        }
+        let mut sum = acc[0];
+        for v in acc {
+            sum = S::add(sum, v);
+        }
+        let mut out = [0.0f32; 16];
+        S::store(out.as_mut_ptr(), sum);
+        black_box(out);
+    }
+    (STEPS * N * S::LANES * 2) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn peak_is_positive() {
+        assert!(super::peak_gflops(2, 2.0) > 0.1);
+    }
+}

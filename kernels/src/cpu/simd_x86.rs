@@ -1,0 +1,330 @@
+//! Vectors of x86-64: AVX-512 and AVX2 with FMA.
+use super::simd::{Kernel, Simd};
+use std::arch::x86_64::*;
+
+/// Runs `kernel` with 512-bit vectors.
+///
+/// # Safety
+/// The CPU has AVX-512 F, VL, DQ, BW, AVX2 and FMA, and the kernel's contract holds.
+#[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
+pub(super) unsafe fn run_avx512<K: Kernel>(kernel: K) -> K::Out {
+    // SAFETY: forwarded contract.
+    unsafe { kernel.run::<Avx512>() }
+}
+
+/// Runs `kernel` with 256-bit vectors.
+///
+/// # Safety
+/// The CPU has AVX2 and FMA, and the kernel's contract holds.
+#[target_feature(enable = "avx2,fma")]
+pub(super) unsafe fn run_avx2<K: Kernel>(kernel: K) -> K::Out {
+    // SAFETY: forwarded contract.
+    unsafe { kernel.run::<Avx2>() }
+}
+
+/// Methods that are one floating-point intrinsic.
+macro_rules! float {
+    ($($name:ident($($arg:ident),+) = $intrinsic:ident;)*) => {$(
+        #[inline(always)]
+        unsafe fn $name($($arg: Self::V),+) -> Self::V {
+            // SAFETY: works on registers only; the caller vouches for the instruction set.
+            unsafe { $intrinsic($($arg),+) }
+        }
+    )*};
+}
+
+/// Methods that are one integer intrinsic between casts.
+macro_rules! integer {
+    ($int:ident, $float:ident; $($name:ident = $intrinsic:ident;)*) => {$(
+        #[inline(always)]
+        unsafe fn $name(a: Self::V, b: Self::V) -> Self::V {
+            // SAFETY: works on registers only; the caller vouches for the instruction set.
+            unsafe { $float($intrinsic($int(a), $int(b))) }
+        }
+    )*};
+}
+
+/// Methods with a body that works on registers only.
+macro_rules! registers {
+    ($(fn $name:ident($($arg:ident: $ty:ty),+) -> $out:ty $body:block)*) => {$(
+        #[inline(always)]
+        unsafe fn $name($($arg: $ty),+) -> $out {
+            // SAFETY: works on registers only; the caller vouches for the instruction set.
+            unsafe { $body }
+        }
+    )*};
+}
+
+/// 16 lanes.
+pub(super) struct Avx512;
+
+impl Avx512 {
+    /// Mask of the first `n < 16` lanes.
+    #[inline(always)]
+    fn head(n: usize) -> __mmask16 {
+        ((1u32 << (n & 15)) - 1) as __mmask16
+    }
+}
+
+impl Simd for Avx512 {
+    const LANES: usize = 16;
+    const WIDE: bool = true;
+    type V = __m512;
+    type M = __mmask16;
+
+    #[inline(always)]
+    unsafe fn load(p: *const f32) -> __m512 {
+        // SAFETY: the caller vouches for 16 lanes at `p`.
+        unsafe { _mm512_loadu_ps(p) }
+    }
+
+    #[inline(always)]
+    unsafe fn store(p: *mut f32, v: __m512) {
+        // SAFETY: the caller vouches for 16 lanes at `p`.
+        unsafe { _mm512_storeu_ps(p, v) }
+    }
+
+    #[inline(always)]
+    unsafe fn load_head(p: *const f32, n: usize) -> __m512 {
+        // SAFETY: the caller vouches for `n` lanes at `p`; masked lanes are not accessed.
+        unsafe { _mm512_maskz_loadu_ps(Self::head(n), p) }
+    }
+
+    #[inline(always)]
+    unsafe fn store_head(p: *mut f32, n: usize, v: __m512) {
+        // SAFETY: the caller vouches for `n` lanes at `p`; masked lanes are not accessed.
+        unsafe { _mm512_mask_storeu_ps(p, Self::head(n), v) }
+    }
+
+    #[inline(always)]
+    unsafe fn prefetch(p: *const f32) {
+        // SAFETY: a prefetch never faults.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(p.cast()) }
+    }
+
+    float! {
+        add(a, b) = _mm512_add_ps;
+        sub(a, b) = _mm512_sub_ps;
+        mul(a, b) = _mm512_mul_ps;
+        div(a, b) = _mm512_div_ps;
+        fma(a, b, c) = _mm512_fmadd_ps;
+        min(a, b) = _mm512_min_ps;
+        max(a, b) = _mm512_max_ps;
+        sqrt(a) = _mm512_sqrt_ps;
+        and(a, b) = _mm512_and_ps;
+        or(a, b) = _mm512_or_ps;
+        xor(a, b) = _mm512_xor_ps;
+        scale(p, n) = _mm512_scalef_ps;
+    }
+
+    integer! { _mm512_castps_si512, _mm512_castsi512_ps;
+        uadd = _mm512_add_epi32;
+        umul = _mm512_mullo_epi32;
+    }
+
+    registers! {
+        fn splat_bits(bits: u32) -> __m512 { _mm512_castsi512_ps(_mm512_set1_epi32(bits as i32)) }
+        fn floor(a: __m512) -> __m512 { _mm512_roundscale_ps::<{ _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC }>(a) }
+        fn shl(a: __m512, b: __m512) -> __m512 {
+            let amount = _mm512_and_si512(_mm512_castps_si512(b), _mm512_set1_epi32(31));
+            _mm512_castsi512_ps(_mm512_sllv_epi32(_mm512_castps_si512(a), amount))
+        }
+        fn shr(a: __m512, b: __m512) -> __m512 {
+            let amount = _mm512_and_si512(_mm512_castps_si512(b), _mm512_set1_epi32(31));
+            _mm512_castsi512_ps(_mm512_srlv_epi32(_mm512_castps_si512(a), amount))
+        }
+        fn to_f32(a: __m512) -> __m512 { _mm512_cvtepu32_ps(_mm512_castps_si512(a)) }
+        fn to_u32(a: __m512) -> __m512 {
+            // The maximum is 0 for NaN and negative values; too large ones convert to all ones.
+            _mm512_castsi512_ps(_mm512_cvttps_epu32(_mm512_max_ps(a, _mm512_setzero_ps())))
+        }
+        fn lt(a: __m512, b: __m512) -> __mmask16 { _mm512_cmp_ps_mask::<_CMP_LT_OQ>(a, b) }
+        fn le(a: __m512, b: __m512) -> __mmask16 { _mm512_cmp_ps_mask::<_CMP_LE_OQ>(a, b) }
+        fn eq(a: __m512, b: __m512) -> __mmask16 { _mm512_cmp_ps_mask::<_CMP_EQ_OQ>(a, b) }
+        fn ult(a: __m512, b: __m512) -> __mmask16 {
+            _mm512_cmplt_epu32_mask(_mm512_castps_si512(a), _mm512_castps_si512(b))
+        }
+        fn ueq(a: __m512, b: __m512) -> __mmask16 {
+            _mm512_cmpeq_epi32_mask(_mm512_castps_si512(a), _mm512_castps_si512(b))
+        }
+        fn select(m: __mmask16, a: __m512, b: __m512) -> __m512 { _mm512_mask_blend_ps(m, b, a) }
+    }
+
+    #[inline(always)]
+    unsafe fn add_lane_sums<const N: usize>(acc: &[[__m512; N]; 4], g: *mut f32) {
+        // SAFETY: register operations, and the caller vouches for `4 * 3 + N` lanes at `g`.
+        unsafe {
+            if N == 4 {
+                let r0 = sums_of_row(acc[0][0], acc[0][1], acc[0][2], acc[0][3]);
+                let r1 = sums_of_row(acc[1][0], acc[1][1], acc[1][2], acc[1][3]);
+                let r2 = sums_of_row(acc[2][0], acc[2][1], acc[2][2], acc[2][3]);
+                let r3 = sums_of_row(acc[3][0], acc[3][1], acc[3][2], acc[3][3]);
+                // Each 128-bit quarter of `r` holds a partial sum of all four columns: a 4x4 transposition of
+                // quarters, adding instead of storing.
+                let lower = add_quarters(r0, r1);
+                let upper = add_quarters(r2, r3);
+                let even = _mm512_shuffle_f32x4::<0b10_00_10_00>(lower, upper);
+                let odd = _mm512_shuffle_f32x4::<0b11_01_11_01>(lower, upper);
+                Self::store(g, _mm512_add_ps(Self::load(g), _mm512_add_ps(even, odd)));
+            } else {
+                for i in 0..4 {
+                    for j in 0..N {
+                        *g.add(4 * i + j) += _mm512_reduce_add_ps(acc[i][j]);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Quarter `q` of the result holds, at position `j`, the sum of quarter `q` of the `j`-th argument.
+///
+/// # Safety
+/// The CPU has AVX-512.
+#[inline(always)]
+unsafe fn sums_of_row(a: __m512, b: __m512, c: __m512, d: __m512) -> __m512 {
+    // SAFETY: register operations of AVX-512.
+    unsafe {
+        // [a0+a2 a1+a3 b2+b0 b3+b1] in every quarter, likewise for c and d; a blend is cheaper than a shuffle.
+        let ab = _mm512_add_ps(_mm512_mask_blend_ps(0xcccc, a, b), _mm512_shuffle_ps::<0b01_00_11_10>(a, b));
+        let cd = _mm512_add_ps(_mm512_mask_blend_ps(0xcccc, c, d), _mm512_shuffle_ps::<0b01_00_11_10>(c, d));
+        _mm512_add_ps(_mm512_shuffle_ps::<0b10_00_10_00>(ab, cd), _mm512_shuffle_ps::<0b11_01_11_01>(ab, cd))
+    }
+}
+
+/// Quarters `[p0+p2 p1+p3 q2+q0 q3+q1]`.
+///
+/// # Safety
+/// The CPU has AVX-512.
+#[inline(always)]
+unsafe fn add_quarters(p: __m512, q: __m512) -> __m512 {
+    // SAFETY: register operations of AVX-512.
+    unsafe { _mm512_add_ps(_mm512_mask_blend_ps(0xff00, p, q), _mm512_shuffle_f32x4::<0b01_00_11_10>(p, q)) }
+}
+
+/// 8 lanes.
+pub(super) struct Avx2;
+
+impl Avx2 {
+    /// All bits set in the first `n < 8` lanes.
+    #[inline(always)]
+    unsafe fn head(n: usize) -> __m256i {
+        // SAFETY: register operations of AVX2.
+        unsafe { _mm256_cmpgt_epi32(_mm256_set1_epi32(n as i32), _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7)) }
+    }
+}
+
+impl Simd for Avx2 {
+    const LANES: usize = 8;
+    const WIDE: bool = false;
+    type V = __m256;
+    /// All bits of a lane set or clear.
+    type M = __m256;
+
+    #[inline(always)]
+    unsafe fn load(p: *const f32) -> __m256 {
+        // SAFETY: the caller vouches for 8 lanes at `p`.
+        unsafe { _mm256_loadu_ps(p) }
+    }
+
+    #[inline(always)]
+    unsafe fn store(p: *mut f32, v: __m256) {
+        // SAFETY: the caller vouches for 8 lanes at `p`.
+        unsafe { _mm256_storeu_ps(p, v) }
+    }
+
+    #[inline(always)]
+    unsafe fn load_head(p: *const f32, n: usize) -> __m256 {
+        // SAFETY: the caller vouches for `n` lanes at `p`; masked lanes are not accessed.
+        unsafe { _mm256_maskload_ps(p, Self::head(n)) }
+    }
+
+    #[inline(always)]
+    unsafe fn store_head(p: *mut f32, n: usize, v: __m256) {
+        // SAFETY: the caller vouches for `n` lanes at `p`; masked lanes are not accessed.
+        unsafe { _mm256_maskstore_ps(p, Self::head(n), v) }
+    }
+
+    #[inline(always)]
+    unsafe fn prefetch(p: *const f32) {
+        // SAFETY: a prefetch never faults.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(p.cast()) }
+    }
+
+    float! {
+        add(a, b) = _mm256_add_ps;
+        sub(a, b) = _mm256_sub_ps;
+        mul(a, b) = _mm256_mul_ps;
+        div(a, b) = _mm256_div_ps;
+        fma(a, b, c) = _mm256_fmadd_ps;
+        min(a, b) = _mm256_min_ps;
+        max(a, b) = _mm256_max_ps;
+        sqrt(a) = _mm256_sqrt_ps;
+        floor(a) = _mm256_floor_ps;
+        and(a, b) = _mm256_and_ps;
+        or(a, b) = _mm256_or_ps;
+        xor(a, b) = _mm256_xor_ps;
+    }
+
+    integer! { _mm256_castps_si256, _mm256_castsi256_ps;
+        uadd = _mm256_add_epi32;
+        umul = _mm256_mullo_epi32;
+        ueq = _mm256_cmpeq_epi32;
+    }
+
+    registers! {
+        fn splat_bits(bits: u32) -> __m256 { _mm256_castsi256_ps(_mm256_set1_epi32(bits as i32)) }
+        fn shl(a: __m256, b: __m256) -> __m256 {
+            let amount = _mm256_and_si256(_mm256_castps_si256(b), _mm256_set1_epi32(31));
+            _mm256_castsi256_ps(_mm256_sllv_epi32(_mm256_castps_si256(a), amount))
+        }
+        fn shr(a: __m256, b: __m256) -> __m256 {
+            let amount = _mm256_and_si256(_mm256_castps_si256(b), _mm256_set1_epi32(31));
+            _mm256_castsi256_ps(_mm256_srlv_epi32(_mm256_castps_si256(a), amount))
+        }
+        fn to_f32(a: __m256) -> __m256 {
+            // Both halves convert exactly, so that the multiply-add rounds once.
+            let bits = _mm256_castps_si256(a);
+            let high = _mm256_cvtepi32_ps(_mm256_srli_epi32::<16>(bits));
+            let low = _mm256_cvtepi32_ps(_mm256_and_si256(bits, _mm256_set1_epi32(0xffff)));
+            _mm256_fmadd_ps(high, _mm256_set1_ps(65536.0), low)
+        }
+        fn to_u32(a: __m256) -> __m256 {
+            // Values from 2^31 on convert after subtracting 2^31; too large ones become 0x8000_0000, whence all ones.
+            let limit = _mm256_set1_ps(2_147_483_648.0);
+            let a = _mm256_max_ps(a, _mm256_setzero_ps());
+            let large = _mm256_cmp_ps::<_CMP_GE_OQ>(a, limit);
+            let converted = _mm256_cvttps_epi32(_mm256_sub_ps(a, _mm256_and_ps(large, limit)));
+            let bits = _mm256_add_epi32(converted, _mm256_slli_epi32::<31>(_mm256_castps_si256(large)));
+            let overflow = _mm256_cmp_ps::<_CMP_GE_OQ>(a, _mm256_set1_ps(4_294_967_296.0));
+            _mm256_or_ps(_mm256_castsi256_ps(bits), overflow)
+        }
+        fn lt(a: __m256, b: __m256) -> __m256 { _mm256_cmp_ps::<_CMP_LT_OQ>(a, b) }
+        fn le(a: __m256, b: __m256) -> __m256 { _mm256_cmp_ps::<_CMP_LE_OQ>(a, b) }
+        fn eq(a: __m256, b: __m256) -> __m256 { _mm256_cmp_ps::<_CMP_EQ_OQ>(a, b) }
+        fn ult(a: __m256, b: __m256) -> __m256 {
+            let flip = _mm256_set1_epi32(i32::MIN);
+            let (a, b) = (_mm256_castps_si256(a), _mm256_castps_si256(b));
+            _mm256_castsi256_ps(_mm256_cmpgt_epi32(_mm256_xor_si256(b, flip), _mm256_xor_si256(a, flip)))
+        }
+        fn select(m: __m256, a: __m256, b: __m256) -> __m256 { _mm256_blendv_ps(b, a, m) }
+    }
+
+    #[inline(always)]
+    unsafe fn add_lane_sums<const N: usize>(acc: &[[__m256; N]; 4], g: *mut f32) {
+        // SAFETY: register operations, and the caller vouches for `4 * 3 + N` lanes at `g`.
+        unsafe {
+            for j in 0..N {
+                let ab = _mm256_hadd_ps(acc[0][j], acc[1][j]);
+                let cd = _mm256_hadd_ps(acc[2][j], acc[3][j]);
+                let halves = _mm256_hadd_ps(ab, cd);
+                let sums = _mm_add_ps(_mm256_castps256_ps128(halves), _mm256_extractf128_ps::<1>(halves));
+                let mut column = [0.0f32; 4];
+                _mm_storeu_ps(column.as_mut_ptr(), sums);
+                for i in 0..4 {
+                    *g.add(4 * i + j) += column[i];
+                }
+            }
+        }
+    }
+}
