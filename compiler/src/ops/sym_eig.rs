@@ -87,8 +87,9 @@ fn jacobi(matrix: &[f64], n: usize) -> (Vec<f64>, Vec<f64>) {
         for p in 0..n {
             for q in p + 1..n {
                 let (app, aqq, apq) = (a[p * n + p], a[q * n + q], a[p * n + q]);
-                // Below half a unit in the last place of both diagonal entries: nothing left to do.
-                if apq == 0.0 || (app.abs() + 1e-3 * apq.abs() == app.abs() && aqq.abs() + 1e-3 * apq.abs() == aqq.abs()) {
+                // Too small to change either eigenvalue or, in 53 bits, an eigenvector.
+                let negligible = |diagonal: f64| diagonal.abs() + 100.0 * apq.abs() == diagonal.abs();
+                if negligible(app) && negligible(aqq) {
                     a[p * n + q] = 0.0;
                     a[q * n + p] = 0.0;
                     continue;
