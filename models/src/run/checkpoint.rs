@@ -189,7 +189,7 @@ mod tests {
     fn truncated_and_foreign_files_are_refused() {
         let dir = tempfile::tempdir().unwrap();
         let expected = BTreeMap::from([("w".to_string(), vec![2, 3])]);
-        let error = |expected| Checkpoint::load(dir.path(), expected).unwrap_err().to_string();
+        let error = |expected: &BTreeMap<_, _>| Checkpoint::load(dir.path(), expected).unwrap_err().to_string();
         example().save(dir.path()).unwrap();
         assert!(error(&BTreeMap::from([("w".to_string(), vec![3, 3])])).contains("shape [2, 3], expected [3, 3]"));
         assert!(error(&BTreeMap::new()).contains("this model has no `w`"));
