@@ -37,8 +37,8 @@ impl NeuralImage {
     #[track_caller]
     pub fn color(&self, at: &Tensor, progress: &Tensor) -> Tensor {
         let [start, end] = self.window;
-        let weights = (self.encoding == Encoding::Windowed)
-            .then(|| coarse_to_fine_weights(progress, self.bands, start, end));
+        let weights =
+            (self.encoding == Encoding::Windowed).then(|| coarse_to_fine_weights(progress, self.bands, start, end));
         self.network.apply(&positional_encoding(at, self.bands, weights.as_ref()))
     }
 

@@ -146,7 +146,8 @@ impl PlanarModel {
         let point = Axis::new("point", points);
         let seed = Tensor::data(SEED, Shape::new(&[], 1).with_dtype(DType::U32));
         let step = Tensor::per_step(STEP, Shape::new(&[], 1).with_dtype(DType::U32));
-        let jitter = random::uniform(&Axes::new([self.frame.clone(), point.clone()]), 1, DRAW, &step.wrapping_add(&seed));
+        let jitter =
+            random::uniform(&Axes::new([self.frame.clone(), point.clone()]), 1, DRAW, &step.wrapping_add(&seed));
         let pixels = self.pixel.size() as f64;
         let position = (Tensor::index(&point).to_f32() + jitter) * (pixels / points as f64);
         let index = position.clamp(0.0, pixels - 1.0).to_u32();
