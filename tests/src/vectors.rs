@@ -128,7 +128,11 @@ impl Case {
     /// Panics unless `found` is the output within its tolerance. An output may be a digest: norm, sum, first and last
     /// entries.
     pub fn check(&self, path: &str, found: &[f64]) {
-        let (output, tolerance) = (self.output(path), self.tolerance(path));
+        self.check_within(path, found, 0.0);
+    }
+    /// Like [`Case::check`], with at least the tolerance `floor`.
+    pub fn check_within(&self, path: &str, found: &[f64], floor: f64) {
+        let (output, tolerance) = (self.output(path), self.tolerance(path).max(floor));
         if let Value::Object(digest) = output {
             let compare = |key: &str, found: &[f64]| {
                 if let Some(expected) = digest.get(key) {
