@@ -97,7 +97,7 @@ impl Session {
 
     /// The current value of a float input, in host order; waits for the device.
     pub fn get(&mut self, name: &str) -> Result<Vec<f32>, RunError> {
-        Ok(bytemuck::cast_vec(self.get_lanes(name)?))
+        Ok(bytemuck::allocation::cast_vec(self.get_lanes(name)?))
     }
 
     /// The current lanes of any input, in host order; waits for the device.
@@ -114,7 +114,7 @@ impl Session {
 
     /// A float output of the program's last run, in host order; waits for the device.
     pub fn read(&mut self, program: ProgramId, output: &str) -> Result<Vec<f32>, RunError> {
-        Ok(bytemuck::cast_vec(self.read_lanes(program, output)?))
+        Ok(bytemuck::allocation::cast_vec(self.read_lanes(program, output)?))
     }
 
     /// The lanes of any output, in host order; waits for the device.

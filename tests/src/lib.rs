@@ -1,5 +1,6 @@
 //! What the tests share: seeded numbers, bindings, and the graph around an op under test.
 
+pub mod backend;
 pub mod vectors;
 
 use raygrad_compiler::autodiff::grad;

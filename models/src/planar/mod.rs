@@ -1,0 +1,8 @@
+//! Planar registration: patches of one photo, distorted by unknown warps, are aligned while a neural image is learned
+//! from them.
+
+pub mod model;
+pub mod rates;
+
+pub use model::{PlanarModel, weights};
+pub use rates::Rates;
