@@ -158,7 +158,9 @@ impl Builder {
                 let shapes: Vec<_> = info.operands.iter().map(|o| o.shape().clone()).collect();
                 let flops = info.tensor.op().flops(&shapes, info.tensor.shape());
                 let target = &self.cuts.target;
-                let expensive = flops > target.recompute_flops * width as u64 && width <= target.store_channels;
+                // Over few elements even a wide value takes no memory worth mentioning.
+                let storable = width <= target.store_channels || info.tensor.shape().lanes() <= target.store_lanes;
+                let expensive = flops > target.recompute_flops * width as u64 && storable;
                 candidates.push(Candidate { id, channels: width as u64, expensive, operands });
             }
         }
