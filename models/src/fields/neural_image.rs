@@ -37,17 +37,12 @@ impl NeuralImage {
     #[track_caller]
     pub fn color(&self, at: &Tensor, progress: &Tensor) -> Tensor {
         let [start, end] = self.window;
-        let weights = (self.encoding == Encoding::Windowed)
-            .then(|| coarse_to_fine_weights(progress, self.bands, start, end));
+        let weights =
+            (self.encoding == Encoding::Windowed).then(|| coarse_to_fine_weights(progress, self.bands, start, end));
         self.network.apply(&positional_encoding(at, self.bands, weights.as_ref()))
     }
 
     pub fn parameters(&self) -> Vec<Parameter> {
         self.network.parameters.clone()
-    }
-
-    /// Weights of all layers, for counting operations: a multiplication and an addition each.
-    pub fn weights(&self) -> usize {
-        crate::planar::weights(&self.parameters())
     }
 }

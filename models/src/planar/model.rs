@@ -77,7 +77,8 @@ impl PlanarModel {
         6.0 * rows as f64 * (weights(&self.parameters())) as f64
     }
 
-    /// One training step: outputs `render`, `alignment`, `total` and `transform`, and an update of every parameter.
+    /// One training step: outputs `render`, `total`, `transform` and, where the warp has
+    /// one, `alignment`; and an update of every parameter.
     #[track_caller]
     pub fn train_step(&self) -> Step {
         let (at, target) = match self.settings.data.points_per_patch {
@@ -85,8 +86,7 @@ impl PlanarModel {
             Count::Of(points) => self.drawn_points(points),
         };
         let (found, render) = self.losses(&at, &target);
-        let weight = self.settings.loss.alignment;
-        let total = if weight > 0.0 { &render + &found.residual * weight } else { render.clone() };
+        let total = self.total(&found, &render);
         Step { outputs: losses_and_transform(&found, render, &total), updates: self.updates(&total) }
     }
 
@@ -98,7 +98,7 @@ impl PlanarModel {
         let found = self.register(&at);
         let color = self.field.color(&found.local, &progress());
         let render = mean_squared_error(&color, &self.target());
-        let total = &render + &found.residual * self.settings.loss.alignment;
+        let total = self.total(&found, &render);
         let fields = [("local", &found.local), ("global", &found.global), ("color", &color)];
         let all = Axes::new([self.frame.clone(), self.pixel.clone()]);
         let fields = fields.map(|(name, t)| (name.to_string(), t.broadcast_to(&all)));
@@ -120,6 +120,16 @@ impl PlanarModel {
         let color = self.field.color(&found.local, &progress());
         let render = mean_squared_error(&color, target);
         (found, render)
+    }
+
+    /// A weight of zero removes the alignment term: its gradient is not even computed.
+    #[track_caller]
+    fn total(&self, found: &Registration, render: &Tensor) -> Tensor {
+        let weight = self.settings.loss.alignment;
+        match &found.residual {
+            Some(residual) if weight > 0.0 => render + residual * weight,
+            _ => render.clone(),
+        }
     }
 
     #[track_caller]
@@ -146,7 +156,8 @@ impl PlanarModel {
         let point = Axis::new("point", points);
         let seed = Tensor::data(SEED, Shape::new(&[], 1).with_dtype(DType::U32));
         let step = Tensor::per_step(STEP, Shape::new(&[], 1).with_dtype(DType::U32));
-        let jitter = random::uniform(&Axes::new([self.frame.clone(), point.clone()]), 1, DRAW, &step.wrapping_add(&seed));
+        let jitter =
+            random::uniform(&Axes::new([self.frame.clone(), point.clone()]), 1, DRAW, &step.wrapping_add(&seed));
         let pixels = self.pixel.size() as f64;
         let position = (Tensor::index(&point).to_f32() + jitter) * (pixels / points as f64);
         let index = position.clamp(0.0, pixels - 1.0).to_u32();
@@ -191,13 +202,9 @@ fn progress() -> Tensor {
 }
 
 fn losses_and_transform(found: &Registration, render: Tensor, total: &Tensor) -> Vec<(String, Tensor)> {
-    let outputs = [
-        ("render", render),
-        ("alignment", found.residual.clone()),
-        ("total", total.clone()),
-        ("transform", found.transform.clone()),
-    ];
-    outputs.map(|(name, t)| (name.to_string(), t)).into()
+    let mut outputs = vec![("render", render), ("total", total.clone()), ("transform", found.transform.clone())];
+    outputs.extend(found.residual.clone().map(|r| ("alignment", r)));
+    outputs.into_iter().map(|(name, t)| (name.to_string(), t)).collect()
 }
 
 /// Entries of all weight matrices among the parameters, biases and codes left out.
