@@ -1,5 +1,7 @@
 //! What the tests share: seeded numbers, bindings, and the graph around an op under test.
 
+pub mod backend;
+
 use raygrad_compiler::graph::{Axis, Shape, Tensor};
 use raygrad_compiler::ops::Sample;
 use raygrad_compiler::reference::{Array, Bindings};

@@ -192,7 +192,7 @@ impl Builder {
                 },
                 _ if region.inner.as_ref().is_some_and(|i| t.axes().contains(i)) => {
                     let inputs = operands.iter().map(value).collect();
-                    let product = push_as(region, &t, RegionOp::RowOuter, inputs, region.domain.clone());
+                    let product = push(region, &t, RegionOp::RowOuter, inputs);
                     Store::Reduce { kind: Reduction::Sum, value: product, buffer }
                 }
                 _ => Store::Outer { x: value(&operands[0]), d: value(&operands[1]), buffer },
@@ -271,8 +271,18 @@ fn matrix(w: &Tensor) -> (usize, usize) {
     }
 }
 
+/// Adds an instruction. Its axes are those its operands really vary along: broadcasts were seen through.
 fn push(region: &mut Region, t: &Tensor, op: RegionOp, inputs: Vec<InstId>) -> InstId {
-    push_as(region, t, op, inputs, t.axes().clone())
+    let along = |more: &Axes| inputs.iter().fold(more.clone(), |a, i| a.union(&region.inst(*i).axes));
+    let axes = match &op {
+        RegionOp::Map(_) | RegionOp::Pick(_) | RegionOp::ChannelSum(_) | RegionOp::ChannelMax => along(&Axes::none()),
+        RegionOp::RowLinear { .. } | RegionOp::RowOuter | RegionOp::SymEig { .. } => along(&Axes::none()),
+        RegionOp::Linear(_) => along(t.inputs()[1].axes()),
+        RegionOp::Take { axis, .. } => along(&t.inputs()[0].axes().without(axis)),
+        RegionOp::Load(_) | RegionOp::Const(_) | RegionOp::Index(_) => t.axes().clone(),
+        RegionOp::CumSum { .. } | RegionOp::Shift { .. } => t.axes().clone(),
+    };
+    push_as(region, t, op, inputs, axes)
 }
 
 fn push_as(region: &mut Region, t: &Tensor, op: RegionOp, inputs: Vec<InstId>, axes: Axes) -> InstId {

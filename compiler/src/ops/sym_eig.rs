@@ -79,7 +79,7 @@ fn split(t: &Tensor, n: usize) -> (Tensor, Tensor) {
 }
 
 /// Cyclic Jacobi: every off-diagonal entry in turn is rotated to zero, until all are.
-fn jacobi(matrix: &[f64], n: usize) -> (Vec<f64>, Vec<f64>) {
+pub fn jacobi(matrix: &[f64], n: usize) -> (Vec<f64>, Vec<f64>) {
     let mut a: Vec<f64> = (0..n * n).map(|i| 0.5 * (matrix[i] + matrix[i % n * n + i / n])).collect();
     let mut v: Vec<f64> = (0..n * n).map(|i| if i / n == i % n { 1.0 } else { 0.0 }).collect();
     for _sweep in 0..60 {
