@@ -27,8 +27,10 @@ use std::sync::Arc;
 pub const GRID: &str = "data.grid";
 /// Colours of the distorted patches, `[frame, pixel] x 3`.
 pub const TARGET: &str = "data.target";
-/// Coordinates at which [`PlanarModel::picture`] looks, `[pixel] x 2`.
-pub const VIEW: &str = "data.view";
+/// Coordinates at which [`PlanarModel::picture`] looks, `[view] x 2`.
+pub fn view(pixels: usize) -> String {
+    format!("data.view.{pixels}")
+}
 /// What tells the pixel draws of two seeds apart.
 pub const SEED: &str = "data.seed";
 
@@ -109,7 +111,7 @@ impl PlanarModel {
     /// The learned picture at `pixels` points: output `color`.
     #[track_caller]
     pub fn picture(&self, pixels: usize) -> Step {
-        let view = Tensor::data(VIEW, Shape::new(&[&Axis::new("view", pixels)], 2));
+        let view = Tensor::data(view(pixels), Shape::new(&[&Axis::new("view", pixels)], 2));
         let color = self.field.color(&view, &progress());
         Step { outputs: vec![("color".to_string(), color)], updates: vec![] }
     }
