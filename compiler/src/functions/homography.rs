@@ -25,7 +25,7 @@ pub enum Solver {
     InverseIteration,
 }
 
-/// Keeps scale and quotient finite, as in the library that the reference implementation calls.
+/// Keeps the scale finite, and how small `H_33` may be to divide by it.
 const EPSILON: f64 = 1e-8;
 
 /// The homography `(3, 3)` with `H_33 = 1` that takes points `x` to `y`, both of two channels, along `over`.
@@ -55,7 +55,7 @@ pub fn fit_homography(x: &Tensor, y: &Tensor, over: &Axes, solver: Solver, degen
     let full = matmul(&matmul(&to2.back, &h.reshape((3, 3))), &to1.forth);
     let corner = full.pick(&[8]);
     let divides = corner.abs().greater_than(&Tensor::scalar(EPSILON));
-    let h = &full / divides.select(&(corner + EPSILON), &Tensor::scalar(1.0));
+    let h = &full / divides.select(&corner, &Tensor::scalar(1.0));
     match degenerate {
         Some(mask) => mask.select(&identity(3), &h),
         None => h,

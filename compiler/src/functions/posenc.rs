@@ -5,7 +5,7 @@
 //! w_k = (1 - cos(pi clamp(alpha - k, 0, 1))) / 2,   alpha = L (progress - start) / (end - start)
 //! ```
 //!
-//! The angle is reduced to `-pi..pi` before the sine is taken, in turns and without rounding: `h = 2^(k-1) x` (a power of
+//! The angle is reduced to `-pi..pi` before the sine is taken, in turns, where that is exact: `h = 2^(k-1) x` (a power of
 //! two), plus a quarter turn for the cosine, `t = h - floor(h + 1/2)`, `sin(2 pi t)`.
 
 use crate::graph::Tensor;

@@ -1,6 +1,7 @@
 //! Builds regions from the cuts: walks from what must be stored to what can be loaded.
 
 use super::cuts::{Cuts, Key, view};
+use super::store::{Candidate, choose};
 use super::{Target, merge};
 use crate::graph::{Axes, Shape, Tensor};
 use crate::ops::input::Input;
@@ -110,7 +111,7 @@ impl Builder {
     }
 
     /// Whether `t`, needed by the region `key`, is read from memory.
-    fn loads(&mut self, t: &Tensor, key: &Key) -> bool {
+    fn loads(&self, t: &Tensor, key: &Key) -> bool {
         let info = self.cuts.get(t);
         if info.form == Form::Input {
             return true;
@@ -123,18 +124,54 @@ impl Builder {
             return false;
         }
         debug_assert!(info.domain == key.domain && info.depth < key.depth, "{t:?} of another domain must be stored");
-        let per_channel = info.closure_flops / t.width().max(1) as u64;
-        let worth_storing =
-            per_channel > self.cuts.target.recompute_flops && t.width() <= self.cuts.target.store_channels;
-        if worth_storing {
-            self.store(t);
+        false
+    }
+
+    /// Stores what the region of `key` should not compute again, given what it needs at its own depth.
+    fn store_for(&mut self, key: &Key, ids: &BTreeSet<u64>) {
+        let mut candidates: Vec<Candidate> = vec![];
+        let mut needed = vec![];
+        let mut seen: HashSet<u64> = ids.clone().into_iter().collect();
+        let mut stack: Vec<u64> = ids.iter().copied().collect();
+        while let Some(id) = stack.pop() {
+            let mut operands = vec![];
+            let earlier = self.cuts.nodes[&id].depth < key.depth;
+            for (i, operand) in self.cuts.nodes[&id].operands.clone().into_iter().enumerate() {
+                let user = &self.cuts.nodes[&id];
+                if user.needs_buffer(i) || self.cuts.stored_for(user, i) || self.loads(&operand, key) {
+                    continue;
+                }
+                let info = self.cuts.get(&operand);
+                if info.free {
+                    continue;
+                }
+                if info.depth < key.depth {
+                    if earlier { operands.push(operand.id()) } else { needed.push(operand.id()) }
+                }
+                if seen.insert(operand.id()) {
+                    stack.push(operand.id());
+                }
+            }
+            if earlier {
+                let info = &self.cuts.nodes[&id];
+                let width = info.tensor.width();
+                let shapes: Vec<_> = info.operands.iter().map(|o| o.shape().clone()).collect();
+                let flops = info.tensor.op().flops(&shapes, info.tensor.shape());
+                let target = &self.cuts.target;
+                let expensive = flops > target.recompute_flops * width as u64 && width <= target.store_channels;
+                candidates.push(Candidate { id, channels: width as u64, expensive, operands });
+            }
         }
-        worth_storing
+        for id in choose(&candidates, &needed) {
+            let tensor = self.cuts.nodes[&id].tensor.clone();
+            self.store(&tensor);
+        }
     }
 
     /// The region of `key` that stores `ids`, and the nodes it computes.
     fn region(&mut self, key: &Key, ids: &BTreeSet<u64>) -> (Region, Vec<u64>) {
         self.seen.insert(key.clone());
+        self.store_for(key, ids);
         let mut loads: BTreeSet<u64> = BTreeSet::new();
         let mut computes: BTreeSet<u64> = BTreeSet::new();
         let mut stack: Vec<u64> = ids.iter().copied().collect();

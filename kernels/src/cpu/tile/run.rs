@@ -478,6 +478,13 @@ impl Tile<'_> {
                 }
             }
         };
+        let ld = self.program.ld;
+        let side_by_side = value.places.windows(2).all(|w| w[1] - w[0] == ld as Place);
+        if view.inner == 0 && view.elements == 1 && value.full && side_by_side && kind == Reduction::Sum {
+            let x = self.at(value.places[0]);
+            // SAFETY: all channels at once: `rows` lanes each, `ld` apart, and as many accumulator lanes.
+            return unsafe { rows_sum(self.isa, x, ld, value.places.len(), self.rows, base) };
+        }
         for c in 0..value.places.len() {
             let to = base.wrapping_add(c * view.elements);
             // SAFETY: `rows` lanes of a channel in the scratch.
