@@ -11,7 +11,7 @@ mod local;
 
 pub use fit::fit_global;
 pub use global::GlobalWarp;
-pub use known::KnownWarp;
+pub use known::{KnownWarp, TRUTH as KNOWN_TRUTH};
 pub use local::LocalWarp;
 
 use crate::config::{Dof, Method, Settings, Solver};
