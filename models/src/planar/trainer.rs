@@ -32,6 +32,7 @@ pub struct Trainer {
     frame: (View, ProgramId),
     full: (View, ProgramId),
     device: String,
+    flops: f64,
     /// Steps done.
     step: usize,
     /// Whether any of them was done here, so that the training program has outputs.
@@ -76,6 +77,7 @@ impl Trainer {
             frame,
             full,
             device: name,
+            flops: model.flops(),
             step: 0,
             stepped: false,
         };
@@ -105,6 +107,11 @@ impl Trainer {
         self.session.run(self.train)?;
         (self.step, self.stepped) = (self.step + 1, true);
         Ok(())
+    }
+
+    /// Floating-point operations of a step, see [`PlanarModel::flops`].
+    pub fn flops(&self) -> f64 {
+        self.flops
     }
 
     /// Waits until the last step is done.

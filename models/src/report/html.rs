@@ -81,7 +81,7 @@ impl Report<'_> {
         }
         page.push_str("</div>");
         page.push_str(&self.patches());
-        let _ = write!(page, "<h2>Settings</h2><pre>{}</pre></main></body></html>\n", escape(self.config));
+        let _ = writeln!(page, "<h2>Settings</h2><pre>{}</pre></main></body></html>", escape(self.config));
         Ok(page)
     }
 

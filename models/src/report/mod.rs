@@ -3,5 +3,5 @@
 mod html;
 mod plots;
 
-pub use html::{Picture, Report};
+pub use html::{Picture, Report, duration};
 pub use plots::{Curve, PlotError, plot};
