@@ -19,12 +19,14 @@ pub fn lower(program: &Program, region: &Region) -> TileProgram {
     let mut lowering =
         Lowering { program, region, outer, values: Values::new(region, ld), out: empty(inner, rows, ld) };
     lowering.out.outer = lowering.outer.iter().map(|a| a.size()).collect();
-    // A buffer that is updated in place is read before anything is written.
-    let updated = |id: &InstId| match &region.inst(*id).op {
-        RegionOp::Load(b) => region.stores.iter().any(|s| s.buffer() == *b),
+    // A buffer that is updated in place is read before anything is written. Constants are written once for all tiles:
+    // their places must never have been another value's. Uniform values are small, and layers want their bias first.
+    let early = |id: &InstId| match &region.inst(*id).op {
+        RegionOp::Load(b) => region.is_uniform(*id) || region.stores.iter().any(|s| s.buffer() == *b),
+        RegionOp::Const(_) => true,
         _ => false,
     };
-    let (first, rest): (Vec<InstId>, Vec<InstId>) = region.ids().partition(updated);
+    let (first, rest): (Vec<InstId>, Vec<InstId>) = region.ids().partition(early);
     for id in first {
         lowering.inst(id);
     }
@@ -35,7 +37,7 @@ pub fn lower(program: &Program, region: &Region) -> TileProgram {
             lowering.store(store);
         }
     }
-    for store in region.stores.iter().filter(|s| s.values().iter().max().is_some_and(updated)) {
+    for store in region.stores.iter().filter(|s| s.values().iter().max().is_some_and(early)) {
         lowering.store(store);
     }
     lowering.finish()
@@ -143,7 +145,9 @@ impl Lowering<'_> {
                 self.keep(id);
             }
             RegionOp::Map(program) => {
-                if let Some(fused) = self.layer_of(id) {
+                if let Some(fused) = self.layer_of(id)
+                    && !self.values.known(fused.layer)
+                {
                     return self.layer_as(id, &fused);
                 }
                 self.map(id, inst, program, full);
