@@ -143,7 +143,8 @@ impl Lowering<'_> {
                 self.keep(id);
             }
             RegionOp::Map(program) => {
-                if let Some(fused) = self.layer_of(id) {
+                // A layer that could not wait for this reader has its value already.
+                if let Some(fused) = self.layer_of(id).filter(|f| !self.values.is_known(f.layer)) {
                     return self.layer_as(id, &fused);
                 }
                 self.map(id, inst, program, full);
