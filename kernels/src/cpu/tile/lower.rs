@@ -459,8 +459,9 @@ impl Lowering<'_> {
         };
         let positions = self.out.outer.iter().product::<usize>();
         self.out.direct = positions >= 2 * MAX_CHUNKS && self.out.ops.iter().all(per_outer);
-        let units = if self.out.direct { positions } else { self.out.tiles() };
-        self.out.chunks = units.clamp(1, MAX_CHUNKS);
+        let units = if self.out.direct { positions } else { self.out.tiles() }.max(1);
+        // A chunk's accumulators are worth a few tiles of work each.
+        self.out.chunks = (units / CHUNK_TILES).next_power_of_two().clamp(units.min(2), MAX_CHUNKS);
         self.out
     }
 }
