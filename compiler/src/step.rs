@@ -16,13 +16,13 @@ pub struct Step {
 #[derive(Debug, thiserror::Error)]
 pub enum StepError {
     #[error("{0}")]
-    Record(RecordError),
+    Record(Box<RecordError>),
     #[error("input `{name}` is recorded as {first} and as {second}; one name is one buffer")]
-    Conflict { name: String, first: Shape, second: Shape },
+    Conflict { name: String, first: Box<Shape>, second: Box<Shape> },
     #[error("an update must go to a parameter or state input, found {0}")]
     NotAnInput(String),
     #[error("the new value of `{name}` is {found}, expected {expected}")]
-    UpdateShape { name: String, expected: Shape, found: Shape },
+    UpdateShape { name: String, expected: Box<Shape>, found: Box<Shape> },
     #[error("two updates of `{0}`")]
     TwoUpdates(String),
     #[error("two outputs are called `{0}`")]
@@ -45,14 +45,14 @@ impl Step {
         let targets = self.updates.iter().map(|(input, _)| input);
         let roots = self.roots();
         if let Some(e) = roots.iter().chain(targets.clone()).find_map(Tensor::error) {
-            return Err(StepError::Record(e.clone()));
+            return Err(StepError::Record(Box::new(e.clone())));
         }
         let mut names: HashMap<&str, &Input> = HashMap::new();
         let all = crate::graph::topological(self.roots().into_iter().chain(targets.cloned()));
         for input in all.iter().filter_map(|t| t.op_as::<Input>()) {
             match names.get(&*input.name) {
                 Some(first) if first.shape != input.shape => {
-                    let (first, second) = (first.shape.clone(), input.shape.clone());
+                    let (first, second) = (Box::new(first.shape.clone()), Box::new(input.shape.clone()));
                     return Err(StepError::Conflict { name: input.name.clone(), first, second });
                 }
                 _ => names.insert(&input.name, input),
@@ -71,7 +71,7 @@ impl Step {
                 && value.width() == input.shape.channels.count()
                 && value.dtype() == input.shape.dtype;
             if !fits {
-                let (expected, found) = (input.shape.clone(), value.shape().clone());
+                let (expected, found) = (Box::new(input.shape.clone()), Box::new(value.shape().clone()));
                 return Err(StepError::UpdateShape { name: input.name.clone(), expected, found });
             }
         }

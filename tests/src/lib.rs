@@ -1,8 +1,12 @@
 //! What the tests share: seeded numbers, bindings, and the graph around an op under test.
 
+pub mod backend;
+pub mod vectors;
+
+use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::graph::{Axis, Shape, Tensor};
 use raygrad_compiler::ops::Sample;
-use raygrad_compiler::reference::{Array, Bindings};
+use raygrad_compiler::reference::{Array, Bindings, Direction, central_difference, evaluate};
 
 /// Seeded random numbers (splitmix64: Steele, Lea, Flood, Fast splittable pseudorandom number generators, 2014).
 pub struct Rng(pub u64);
@@ -70,6 +74,45 @@ pub fn worst(found: &[f64], expected: &[f64], floor: f64) -> f64 {
     // A NaN anywhere must not pass: `max` would drop it.
     let far = |(a, b): (&f64, &f64)| if (a - b).is_nan() { f64::INFINITY } else { (a - b).abs() };
     found.iter().zip(expected).map(far).fold(0.0, f64::max) / scale
+}
+
+const STEP: f64 = 2e-3;
+
+/// Gradient of `output` with respect to each parameter, compared with central differences lane by lane and along one
+/// random direction; `tolerance` is relative to the largest derivative.
+pub fn check_gradient(output: &Tensor, parameters: &[Tensor], bindings: &Bindings, tolerance: f64, what: &str) {
+    let wanted: Vec<&Tensor> = parameters.iter().collect();
+    let gradients = grad(output, &wanted);
+    for (p, g) in parameters.iter().zip(&gradients) {
+        assert_eq!(g.shape(), p.shape(), "{what}: the gradient has another shape");
+    }
+    let found = evaluate(&gradients, bindings).unwrap_or_else(|e| panic!("{what}: {e}"));
+    for (p, g) in parameters.iter().zip(&found) {
+        let name = p.input_name().expect("a parameter has a name");
+        let difference = |d: &Direction| central_difference(output, bindings, name, d, STEP).expect("evaluates");
+        let lanes: Vec<f64> = (0..g.f().len()).map(|i| difference(&Direction::Lane(i))).collect();
+        let error = worst(g.f(), &lanes, 1e-2);
+        assert!(error < tolerance, "{what}, {name}: off by {error:.2e}\n{:?}\n{lanes:?}", g.f());
+        let mut rng = Rng(seed(what));
+        let v: Vec<f64> = lanes.iter().map(|_| rng.uniform(-1.0, 1.0)).collect();
+        let along: f64 = g.f().iter().zip(&v).map(|(g, v)| g * v).sum();
+        let error = worst(&[along], &[difference(&Direction::Along(&v))], 1e-2);
+        assert!(error < tolerance, "{what}, {name}: off by {error:.2e} along a direction");
+    }
+}
+
+/// The same for the derivative of the gradient along a random direction.
+pub fn check_second_order(output: &Tensor, parameters: &[Tensor], bindings: &Bindings, tolerance: f64, what: &str) {
+    let wanted: Vec<&Tensor> = parameters.iter().collect();
+    let mut bindings = bindings.clone();
+    let mut rng = Rng(seed(what) ^ 1);
+    let paired = grad(output, &wanted).into_iter().zip(parameters).enumerate().map(|(i, (g, p))| {
+        let name = format!("v{i}");
+        bindings.insert(name.clone(), rng.array(p.shape(), -1.0, 1.0));
+        total(&(g * Tensor::data(name, p.shape().clone())))
+    });
+    let slope = paired.reduce(|a, b| a + b).expect("there are parameters");
+    check_gradient(&slope, parameters, &bindings, tolerance, what);
 }
 
 /// An array of the given axes and channels.

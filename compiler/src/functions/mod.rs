@@ -1,2 +1,33 @@
 //! Derived operations: plain functions of ops, with no rules of their own.
+//!
+//! | module | what |
+//! |---|---|
+//! | [`matrix`] | small matrices in channels: products, application to points, rigid poses, linear solve |
+//! | [`lie`] | exponentials of rotations, rigid motions and homographies |
+//! | [`posenc`] | positional encoding and its coarse-to-fine weights |
+//! | [`mlp`] | multi-layer perceptrons |
+//! | [`rigid_fit`] | closed-form rotation, translation and rigid motion between point sets |
+//! | [`homography`] | direct linear transform |
+//! | [`image`] | bilinear lookup |
+//! | [`loss`], [`adam`] | mean squared error, the Adam update |
+pub mod adam;
+pub mod homography;
+pub mod image;
+pub mod lie;
+pub mod loss;
 pub mod matrix;
+pub mod mlp;
+pub mod posenc;
+pub mod rigid_fit;
+
+use crate::graph::Tensor;
+
+/// `t` if it has `n` channels, else what [`Tensor::misfit`] gives for function `name`.
+#[track_caller]
+pub(crate) fn expect_width(name: &'static str, what: &str, t: &Tensor, n: usize) -> Result<(), Tensor> {
+    if t.width() == n || t.error().is_some() {
+        return Ok(());
+    }
+    let problem = format!("{what} have {} channels, not {n}", t.channels());
+    Err(Tensor::misfit(name, &[t], problem, format!("{what} have {n} channels")))
+}

@@ -1,6 +1,7 @@
 //! Builds regions from the cuts: walks from what must be stored to what can be loaded.
 
 use super::cuts::{Cuts, Key, view};
+use super::store::{Candidate, choose};
 use super::{Target, merge};
 use crate::graph::{Axes, Shape, Tensor};
 use crate::ops::input::Input;
@@ -110,7 +111,7 @@ impl Builder {
     }
 
     /// Whether `t`, needed by the region `key`, is read from memory.
-    fn loads(&mut self, t: &Tensor, key: &Key) -> bool {
+    fn loads(&self, t: &Tensor, key: &Key) -> bool {
         let info = self.cuts.get(t);
         if info.form == Form::Input {
             return true;
@@ -123,18 +124,62 @@ impl Builder {
             return false;
         }
         debug_assert!(info.domain == key.domain && info.depth < key.depth, "{t:?} of another domain must be stored");
-        let per_channel = info.closure_flops / t.width().max(1) as u64;
-        let worth_storing =
-            per_channel > self.cuts.target.recompute_flops && t.width() <= self.cuts.target.store_channels;
-        if worth_storing {
-            self.store(t);
+        false
+    }
+
+    /// Stores what the region of `key` should not compute again, given what it needs at its own depth.
+    fn store_for(&mut self, key: &Key, ids: &BTreeSet<u64>) {
+        let mut candidates: Vec<Candidate> = vec![];
+        let mut needed = vec![];
+        let mut room = self.cuts.target.store_bytes;
+        let mut seen: HashSet<u64> = ids.clone().into_iter().collect();
+        let mut stack: Vec<u64> = ids.iter().copied().collect();
+        while let Some(id) = stack.pop() {
+            let mut operands = vec![];
+            let earlier = self.cuts.nodes[&id].depth < key.depth;
+            for (i, operand) in self.cuts.nodes[&id].operands.clone().into_iter().enumerate() {
+                let user = &self.cuts.nodes[&id];
+                if user.needs_buffer(i) || self.cuts.stored_for(user, i) || self.loads(&operand, key) {
+                    continue;
+                }
+                let info = self.cuts.get(&operand);
+                if info.free {
+                    continue;
+                }
+                if info.depth < key.depth {
+                    if earlier { operands.push(operand.id()) } else { needed.push(operand.id()) }
+                }
+                if seen.insert(operand.id()) {
+                    stack.push(operand.id());
+                }
+            }
+            if earlier {
+                let info = &self.cuts.nodes[&id];
+                let width = info.tensor.width();
+                let shapes: Vec<_> = info.operands.iter().map(|o| o.shape().clone()).collect();
+                let flops = info.tensor.op().flops(&shapes, info.tensor.shape());
+                let target = &self.cuts.target;
+                let costly = flops > target.recompute_flops * width as u64;
+                // Wide values are stored as long as there is room; over few elements they take none worth mentioning.
+                let bytes = 4 * info.tensor.shape().lanes();
+                let narrow = width <= target.store_channels || bytes <= target.store_free_bytes;
+                let expensive = costly && (narrow || bytes <= room);
+                if expensive && !narrow {
+                    room -= bytes;
+                }
+                candidates.push(Candidate { id, channels: width as u64, expensive, operands });
+            }
         }
-        worth_storing
+        for id in choose(&candidates, &needed) {
+            let tensor = self.cuts.nodes[&id].tensor.clone();
+            self.store(&tensor);
+        }
     }
 
     /// The region of `key` that stores `ids`, and the nodes it computes.
     fn region(&mut self, key: &Key, ids: &BTreeSet<u64>) -> (Region, Vec<u64>) {
         self.seen.insert(key.clone());
+        self.store_for(key, ids);
         let mut loads: BTreeSet<u64> = BTreeSet::new();
         let mut computes: BTreeSet<u64> = BTreeSet::new();
         let mut stack: Vec<u64> = ids.iter().copied().collect();
@@ -192,7 +237,7 @@ impl Builder {
                 },
                 _ if region.inner.as_ref().is_some_and(|i| t.axes().contains(i)) => {
                     let inputs = operands.iter().map(value).collect();
-                    let product = push_as(region, &t, RegionOp::RowOuter, inputs, region.domain.clone());
+                    let product = push(region, &t, RegionOp::RowOuter, inputs);
                     Store::Reduce { kind: Reduction::Sum, value: product, buffer }
                 }
                 _ => Store::Outer { x: value(&operands[0]), d: value(&operands[1]), buffer },
@@ -271,8 +316,18 @@ fn matrix(w: &Tensor) -> (usize, usize) {
     }
 }
 
+/// Adds an instruction. Its axes are those its operands really vary along: broadcasts were seen through.
 fn push(region: &mut Region, t: &Tensor, op: RegionOp, inputs: Vec<InstId>) -> InstId {
-    push_as(region, t, op, inputs, t.axes().clone())
+    let along = |more: &Axes| inputs.iter().fold(more.clone(), |a, i| a.union(&region.inst(*i).axes));
+    let axes = match &op {
+        RegionOp::Map(_) | RegionOp::Pick(_) | RegionOp::ChannelSum(_) | RegionOp::ChannelMax => along(&Axes::none()),
+        RegionOp::RowLinear { .. } | RegionOp::RowOuter | RegionOp::SymEig { .. } => along(&Axes::none()),
+        RegionOp::Linear(_) => along(t.inputs()[1].axes()),
+        RegionOp::Take { axis, .. } => along(&t.inputs()[0].axes().without(axis)),
+        RegionOp::Load(_) | RegionOp::Const(_) | RegionOp::Index(_) => t.axes().clone(),
+        RegionOp::CumSum { .. } | RegionOp::Shift { .. } => t.axes().clone(),
+    };
+    push_as(region, t, op, inputs, axes)
 }
 
 fn push_as(region: &mut Region, t: &Tensor, op: RegionOp, inputs: Vec<InstId>, axes: Axes) -> InstId {

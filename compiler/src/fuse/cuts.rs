@@ -189,7 +189,8 @@ impl Cuts {
         view(t).is_some_and(|(buffer, _)| self.get(&buffer).form == Form::Input)
     }
 
-    /// Moves nodes as late as their users in the same region allow, and updates (which nobody waits for) to the last one.
+    /// Over a single element, moves nodes as late as their users allow, and updates (which nobody waits for) to the last
+    /// region: all parameters are then updated in one launch. Elsewhere nodes stay early: what they leave behind is smaller.
     fn sink(&mut self, roots: &[Tensor]) {
         let mut users: HashMap<u64, Vec<(u64, usize)>> = HashMap::new();
         for id in &self.order {
@@ -201,7 +202,7 @@ impl Cuts {
             roots.iter().map(|r| self.get(r)).filter(|i| i.domain.is_empty()).map(|i| i.depth).max().unwrap_or(0);
         for id in self.order.clone().into_iter().rev() {
             let info = &self.nodes[&id];
-            if info.free || info.reduces {
+            if info.free || info.reduces || !info.domain.is_empty() {
                 continue;
             }
             let users = users.get(&id).map_or(&[][..], |u| u);
@@ -212,9 +213,8 @@ impl Cuts {
             let is_root = roots.iter().any(|r| r.id() == id);
             let earliest = users.iter().map(|(u, _)| self.nodes[u].depth).min();
             let depth = match earliest {
-                Some(d) if in_place && !is_root => d.max(info.depth),
-                None if is_root && info.domain.is_empty() => last.max(info.depth),
-                Some(d) if in_place && is_root && info.domain.is_empty() => d.max(info.depth),
+                Some(d) if in_place => d.max(info.depth),
+                None if is_root => last.max(info.depth),
                 _ => info.depth,
             };
             if let Some(info) = self.nodes.get_mut(&id) {

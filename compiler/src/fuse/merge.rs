@@ -52,7 +52,7 @@ pub(super) fn merge(region: Region) -> Region {
         body[at] =
             Inst { op: RegionOp::Map(Arc::new(merged.program)), inputs: merged.inputs, label: label.join("+"), ..inst };
     }
-    sweep(Region { body, ..region })
+    Region { body, ..region }.swept()
 }
 
 enum Operand {
@@ -98,28 +98,4 @@ impl Merged {
         }
         Val::Inst(self.program.code.len() as u16 - 1)
     }
-}
-
-/// Drops instructions that no store needs and renumbers the rest.
-fn sweep(region: Region) -> Region {
-    let mut live = vec![false; region.body.len()];
-    for value in region.stores.iter().flat_map(|s| s.values()) {
-        live[value.0 as usize] = true;
-    }
-    for at in (0..region.body.len()).rev() {
-        if live[at] {
-            region.body[at].inputs.iter().for_each(|i| live[i.0 as usize] = true);
-        }
-    }
-    let mut new_id = vec![InstId(0); region.body.len()];
-    let mut body = vec![];
-    for (at, inst) in region.body.into_iter().enumerate() {
-        if live[at] {
-            new_id[at] = InstId(body.len() as u32);
-            let inputs = inst.inputs.iter().map(|i| new_id[i.0 as usize]).collect();
-            body.push(Inst { inputs, ..inst });
-        }
-    }
-    let stores = region.stores.iter().map(|s| s.map_values(|v| new_id[v.0 as usize])).collect();
-    Region { body, stores, ..region }
 }

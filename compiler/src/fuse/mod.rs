@@ -5,12 +5,14 @@
 //! weights, between domains, and, on a GPU, around wide layers. Nodes of one depth and domain form one region. Values
 //! that are cheap to get from inputs are *free*: every region that needs them computes them itself.
 //!
-//! What a region needs from an earlier region of the same domain is either stored or computed again: narrow expensive
-//! values are stored, wide ones recomputed (see [`Target::store_channels`]).
+//! What a region needs from an earlier region of the same domain is either stored or computed again: the fewest channels
+//! are stored that spare it from computing narrow expensive values again; wide ones are recomputed (see
+//! [`Target::store_channels`]).
 
 mod build;
 mod cuts;
 mod merge;
+mod store;
 
 pub use build::{Fused, Origin, fuse};
 
@@ -18,9 +20,14 @@ pub use build::{Fused, Origin, fuse};
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Target {
     pub kind: TargetKind,
-    /// A value needed by a later region of the same domain is stored if it has at most this many channels, else recomputed.
+    /// Expensive values of at most this many channels are not computed again by a later region: they, or fewer channels
+    /// computed from them, are stored.
     pub store_channels: usize,
-    /// Operations per channel up to which a value is computed again rather than stored.
+    /// So are expensive values of at most this many bytes.
+    pub store_free_bytes: usize,
+    /// And wider ones, as long as those of one region take no more bytes than this together.
+    pub store_bytes: usize,
+    /// Operations per channel up to which an op is not expensive.
     pub recompute_flops: u64,
     /// Operations per element up to which values computed from inputs alone are free.
     pub free_flops: u64,
@@ -36,9 +43,23 @@ pub enum TargetKind {
 
 impl Target {
     pub fn cpu() -> Target {
-        Target { kind: TargetKind::Cpu, store_channels: 32, recompute_flops: 64, free_flops: 600 }
+        Target {
+            kind: TargetKind::Cpu,
+            store_channels: 32,
+            store_free_bytes: 1 << 18,
+            store_bytes: 192 << 20,
+            recompute_flops: 64,
+            free_flops: 600,
+        }
     }
     pub fn gpu() -> Target {
-        Target { kind: TargetKind::Gpu, store_channels: usize::MAX, recompute_flops: 16, free_flops: 600 }
+        Target {
+            kind: TargetKind::Gpu,
+            store_channels: usize::MAX,
+            store_free_bytes: 0,
+            store_bytes: 0,
+            recompute_flops: 16,
+            free_flops: 600,
+        }
     }
 }

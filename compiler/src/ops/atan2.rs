@@ -1,4 +1,5 @@
-//! The angle of the vector `(x, y)`, `atan2(y, x)`; operands y, x. The gradient is `(x, -y) / (x^2 + y^2)`.
+//! The angle of the vector `(x, y)`, `atan2(y, x)`; operands y, x. The gradient is `(x, -y) / (x^2 + y^2)`, and 0 at
+//! the origin.
 
 use super::pointwise::binary;
 use super::{Pointwise, Sample, map};
@@ -21,7 +22,10 @@ impl Pointwise for Atan2 {
     }
     fn vjp(&self, x: &[Tensor], _: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
         let (y, x) = (&x[0], &x[1]);
-        let scaled = g / (x * x + y * y);
+        let (zero, one) = (Tensor::scalar(0.0), Tensor::scalar(1.0));
+        let square = x * x + y * y;
+        let origin = square.equal(&zero);
+        let scaled = origin.select(&zero, &(g / origin.select(&one, &square)));
         vec![Some(&scaled * x), Some(-(scaled * y))]
     }
     fn lower(&self, b: &mut ScalarBuilder, a: &[Val]) -> Val {

@@ -1,4 +1,4 @@
-//! Division, `a / b`.
+//! Division, `a / b`. Where `b` is 0 the gradient is 0, so that a quotient in a branch not taken does no harm.
 
 use super::pointwise::{binary, unary};
 use super::{Pointwise, Sample, map};
@@ -20,8 +20,13 @@ impl Pointwise for Div {
         Lane::F(a[0].f() / a[1].f())
     }
     fn vjp(&self, x: &[Tensor], y: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
-        let da = g / &x[1];
-        let db = -(&da * y);
+        let (zero, one) = (Tensor::scalar(0.0), Tensor::scalar(1.0));
+        if x[1].as_constant().is_some_and(|b| b.iter().all(|b| *b != 0.0)) {
+            return vec![Some(g / &x[1]), None];
+        }
+        let void = x[1].equal(&zero);
+        let da = void.select(&zero, &(g / void.select(&one, &x[1])));
+        let db = -(&da * void.select(&zero, y));
         vec![Some(da), Some(db)]
     }
     fn lower(&self, b: &mut ScalarBuilder, a: &[Val]) -> Val {

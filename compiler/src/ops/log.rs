@@ -1,4 +1,4 @@
-//! Natural logarithm; `y' = 1 / x`.
+//! Natural logarithm; `y' = 1 / x`, and 0 where `x <= 0`.
 
 use super::pointwise::unary;
 use super::{Pointwise, Sample, map};
@@ -20,7 +20,9 @@ impl Pointwise for Log {
         Lane::F(a[0].f().ln())
     }
     fn vjp(&self, x: &[Tensor], _: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
-        vec![Some(g / &x[0])]
+        let (zero, one) = (Tensor::scalar(0.0), Tensor::scalar(1.0));
+        let positive = x[0].greater_than(&zero);
+        vec![Some(positive.select(&(g / positive.select(&x[0], &one)), &zero))]
     }
     fn lower(&self, b: &mut ScalarBuilder, a: &[Val]) -> Val {
         b.emit(Prim::Log, a)

@@ -79,7 +79,7 @@ fn split(t: &Tensor, n: usize) -> (Tensor, Tensor) {
 }
 
 /// Cyclic Jacobi: every off-diagonal entry in turn is rotated to zero, until all are.
-fn jacobi(matrix: &[f64], n: usize) -> (Vec<f64>, Vec<f64>) {
+pub fn jacobi(matrix: &[f64], n: usize) -> (Vec<f64>, Vec<f64>) {
     let mut a: Vec<f64> = (0..n * n).map(|i| 0.5 * (matrix[i] + matrix[i % n * n + i / n])).collect();
     let mut v: Vec<f64> = (0..n * n).map(|i| if i / n == i % n { 1.0 } else { 0.0 }).collect();
     for _sweep in 0..60 {
@@ -87,8 +87,9 @@ fn jacobi(matrix: &[f64], n: usize) -> (Vec<f64>, Vec<f64>) {
         for p in 0..n {
             for q in p + 1..n {
                 let (app, aqq, apq) = (a[p * n + p], a[q * n + q], a[p * n + q]);
-                // Below half a unit in the last place of both diagonal entries: nothing left to do.
-                if apq == 0.0 || (app.abs() + 1e-3 * apq.abs() == app.abs() && aqq.abs() + 1e-3 * apq.abs() == aqq.abs()) {
+                // Too small to change either eigenvalue or, in 53 bits, an eigenvector.
+                let negligible = |diagonal: f64| diagonal.abs() + 100.0 * apq.abs() == diagonal.abs();
+                if negligible(app) && negligible(aqq) {
                     a[p * n + q] = 0.0;
                     a[q * n + p] = 0.0;
                     continue;

@@ -95,8 +95,18 @@ fn plan(step: &Step, fused: Fused, target: Target) -> Program {
         .map(|(region, recomputed)| Launch { name: String::new(), region, recomputed })
         .collect();
     let (outputs, updates) = fused.roots.split_at(step.outputs.len());
-    for ((input, value), source) in step.updates.iter().zip(updates) {
-        let target_buffer = input_buffer(&mut buffers, input);
+    let targets: Vec<BufferId> = step.updates.iter().map(|(input, _)| input_buffer(&mut buffers, input)).collect();
+    for (((_, value), source), target_buffer) in step.updates.iter().zip(updates).zip(targets.iter().copied()) {
+        // The old value of an input that is itself updated is set aside first.
+        let mut source = source;
+        let aside;
+        if targets.contains(source) && *source != target_buffer {
+            let Buffer { shape, label, .. } = buffers[source.0 as usize].clone();
+            buffers.push(Buffer { kind: BufferKind::Temporary { slot: 0 }, shape, label });
+            aside = BufferId(buffers.len() as u32 - 1);
+            launches.insert(0, copy(&buffers, *source, aside));
+            source = &aside;
+        }
         let taken = outputs.contains(source) || updates.iter().filter(|u| *u == source).count() > 1;
         if !taken && value.input_name().is_none() && replaces_in_place(&launches, *source, target_buffer, &buffers) {
             rename(&mut launches, *source, target_buffer);

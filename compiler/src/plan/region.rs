@@ -200,4 +200,28 @@ impl Region {
         });
         body.sum::<u64>() + stores.sum::<u64>()
     }
+
+    /// The region without instructions that no store needs, renumbered.
+    pub fn swept(self) -> Region {
+        let mut live = vec![false; self.body.len()];
+        for value in self.stores.iter().flat_map(|s| s.values()) {
+            live[value.0 as usize] = true;
+        }
+        for at in (0..self.body.len()).rev() {
+            if live[at] {
+                self.body[at].inputs.iter().for_each(|i| live[i.0 as usize] = true);
+            }
+        }
+        let mut new_id = vec![InstId(0); self.body.len()];
+        let mut body = vec![];
+        for (at, inst) in self.body.into_iter().enumerate() {
+            if live[at] {
+                new_id[at] = InstId(body.len() as u32);
+                let inputs = inst.inputs.iter().map(|i| new_id[i.0 as usize]).collect();
+                body.push(Inst { inputs, ..inst });
+            }
+        }
+        let stores = self.stores.iter().map(|s| s.map_values(|v| new_id[v.0 as usize])).collect();
+        Region { body, stores, ..self }
+    }
 }

@@ -1,8 +1,9 @@
 //! Matrix product of packed weights with a channel-major tile: `y = bias + W x`.
 //!
-//! The micro-kernel keeps an `MR` x `NV` block of accumulator vectors, `MR` outputs by `NV` vectors of rows, and per step
-//! of the contraction loads `NV` vectors of `x` and broadcasts `MR` weights. Row blocks are the outer loop, so that the
-//! slab of `x` that a block reads stays in the L1 cache while the panels stream through.
+//! The micro-kernel keeps an `MR` x `NV` block of accumulator vectors, `MR` outputs by `NV` vectors of rows, and per
+//! step of the contraction loads `NV` vectors of `x` and broadcasts `MR` weights; the fewer of them are kept in
+//! registers while the others pass. Row blocks are the outer loop, so that the slab of `x` that a block reads stays in
+//! the L1 cache while the panels stream through.
 use super::panels::{PANEL, panel_len};
 use super::simd::{Kernel, Simd, launch};
 use super::{Isa, ROW_BLOCK};
@@ -50,32 +51,30 @@ pub struct Gemm {
 pub unsafe fn gemm(isa: Isa, args: Gemm) {
     debug_assert_eq!(args.rows % ROW_BLOCK, 0);
     // SAFETY: forwarded contract.
-    unsafe { launch(isa, args) }
+    unsafe { launch(isa, &args) }
 }
 
 impl Kernel for Gemm {
     type Out = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    unsafe fn run<S: Simd>(&self) {
         // SAFETY: forwarded contract. `NV * LANES` divides `ROW_BLOCK`.
         unsafe {
-            if S::WIDE {
-                const { assert!(!S::WIDE || ROW_BLOCK.is_multiple_of(2 * S::LANES)) };
-                self.blocks::<S, 8, 2>();
-            } else {
-                const { assert!(ROW_BLOCK.is_multiple_of(2 * S::LANES)) };
-                self.blocks::<S, 4, 2>();
+            match S::REGISTERS {
+                32.. => self.blocks::<S, 8, 2>(),
+                16.. => self.blocks::<S, 3, 4>(),
+                _ => self.blocks::<S, 2, 2>(),
             }
         }
     }
 }
 
 impl Gemm {
-    /// All blocks of `MR` outputs and `NV` vectors.
+    /// All blocks of `MR` outputs and `NV` vectors, fewer outputs where a panel or the outputs end.
     ///
     /// # Safety
-    /// As [`gemm`], and `NV * S::LANES` divides `rows`, `MR` divides [`PANEL`].
+    /// As [`gemm`], and `NV * S::LANES` divides `rows`.
     #[inline(always)]
     unsafe fn blocks<S: Simd, const MR: usize, const NV: usize>(&self) {
         let panel_size = panel_len(self.contraction, PANEL);
@@ -83,7 +82,7 @@ impl Gemm {
         while row < self.rows {
             let mut output = 0;
             while output < self.outputs {
-                let count = MR.min(self.outputs - output);
+                let count = MR.min(self.outputs - output).min(PANEL - output % PANEL);
                 // SAFETY: `output < outputs`, so that its panel exists; each block has `count` outputs left, and
                 // `row + NV * LANES <= rows` since the block height divides `rows`.
                 unsafe {
@@ -92,7 +91,7 @@ impl Gemm {
                         1 => self.block::<S, 1, NV>(panel, output, row),
                         2 => self.block::<S, 2, NV>(panel, output, row),
                         3 => self.block::<S, 3, NV>(panel, output, row),
-                        // A count below `MR` here means `MR == 8`.
+                        // Guarded, so that narrow kernels do not compile blocks that they never need.
                         4 if MR > 4 => self.block::<S, 4, NV>(panel, output, row),
                         5 if MR > 4 => self.block::<S, 5, NV>(panel, output, row),
                         6 if MR > 4 => self.block::<S, 6, NV>(panel, output, row),
@@ -126,14 +125,27 @@ impl Gemm {
             let mut x = self.x.add(row);
             let mut weights = panel;
             for _ in 0..self.contraction {
-                let mut xs = [zero; NV];
-                for j in 0..NV {
-                    xs[j] = S::load(x.add(j * S::LANES));
-                }
-                for i in 0..MR {
-                    let w = S::splat(*weights.add(i));
+                if NV > MR {
+                    let mut ws = [zero; MR];
+                    for i in 0..MR {
+                        ws[i] = S::splat(*weights.add(i));
+                    }
                     for j in 0..NV {
-                        acc[i][j] = S::fma(w, xs[j], acc[i][j]);
+                        let v = S::load(x.add(j * S::LANES));
+                        for i in 0..MR {
+                            acc[i][j] = S::fma(ws[i], v, acc[i][j]);
+                        }
+                    }
+                } else {
+                    let mut xs = [zero; NV];
+                    for j in 0..NV {
+                        xs[j] = S::load(x.add(j * S::LANES));
+                    }
+                    for i in 0..MR {
+                        let w = S::splat(*weights.add(i));
+                        for j in 0..NV {
+                            acc[i][j] = S::fma(w, xs[j], acc[i][j]);
+                        }
                     }
                 }
                 // `wrapping_add`: after the last step the pointer may lie beyond the end of the tile.
@@ -149,8 +161,8 @@ impl Gemm {
         }
     }
 
-    /// Applies the old `y` and the epilogue to the accumulators of a block. One loop per case, because the compiler keeps
-    /// accumulators in registers only in loops simple enough to be unrolled.
+    /// Applies the old `y` and the epilogue to the accumulators of a block. One loop per case, because the compiler
+    /// keeps accumulators in registers only in loops simple enough to be unrolled.
     ///
     /// # Safety
     /// As [`Gemm::block`].

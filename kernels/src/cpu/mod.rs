@@ -5,7 +5,7 @@
 //! transposition. The number of rows is padded to [`ROW_BLOCK`]; padded rows hold finite garbage, which the matrix
 //! kernels may read and write.
 //!
-//! Every kernel is written once, generic over [`simd::Simd`], and [`simd::launch`] instantiates it for each
+//! Every kernel is written once, generic over `simd::Simd`, and `simd::launch` instantiates it for each
 //! instruction set. Which one runs is an explicit argument ([`Isa`]), so that tests cover all of them on one machine.
 #![allow(clippy::needless_range_loop, reason = "indices name the rows and columns of register blocks")]
 pub mod aligned;
@@ -20,6 +20,7 @@ mod simd;
 mod simd_portable;
 #[cfg(target_arch = "x86_64")]
 mod simd_x86;
+pub mod tile;
 pub mod vector;
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! Sum of outer products of two channel-major tiles, `g[k][n] += sum_r x[k][r] d[n][r]`: the gradient of a weight matrix.
+//! Sum of outer products of two channel-major tiles, `g[k][n] += sum_r x[k][r] d[n][r]`: the gradient of weights.
 //!
 //! The sum over rows runs inside vectors, so a 4x4 block of `g` takes 16 accumulator vectors, which a transposing tree
 //! reduces to the 16 sums at the end. `g` therefore lives in **blocks**, `[k / 4][n / 4][4][4]`: one cache line each.
@@ -10,8 +10,8 @@ use super::simd::{Kernel, Simd, launch};
 pub const BLOCK: usize = 4;
 /// Floats of a block.
 const BLOCK_LEN: usize = BLOCK * BLOCK;
-/// Column blocks that are visited for one strip of `x` before the next strip: their rows of `d` stay in the L1 cache.
-const COLUMN_GROUP: usize = 8;
+/// Floats of `d` that stay in the L1 cache while all strips of `x` pass by: half of a small cache.
+const RESIDENT: usize = 4096;
 
 /// Operands of [`outer`].
 #[derive(Clone, Copy, Debug)]
@@ -38,12 +38,12 @@ pub fn outer_len(k: usize, n: usize) -> usize {
 /// Adds the outer products of all rows to `g`; the padding of edge blocks is left alone.
 ///
 /// # Safety
-/// `isa.supported()`. `rows` is a multiple of 16; the pointers are valid for the shapes given at the fields; `g` overlaps
-/// neither `x` nor `d`.
+/// `isa.supported()`. `rows` is a multiple of 16; the pointers are valid for the shapes given at the fields; `g`
+/// overlaps neither `x` nor `d`.
 pub unsafe fn outer(isa: Isa, args: Outer) {
     debug_assert_eq!(args.rows % 16, 0);
     // SAFETY: forwarded contract.
-    unsafe { launch(isa, args) }
+    unsafe { launch(isa, &args) }
 }
 
 /// Copies (or adds) a blocked accumulator to the row-major `[k][n]` matrix `out`.
@@ -68,13 +68,13 @@ impl Kernel for Outer {
     type Out = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    unsafe fn run<S: Simd>(&self) {
         // SAFETY: forwarded contract.
         unsafe {
-            if S::WIDE {
-                self.blocks::<S, 4>();
-            } else {
-                self.blocks::<S, 2>();
+            match S::REGISTERS {
+                32.. => self.blocks::<S, 4>(),
+                16.. => self.blocks::<S, 2>(),
+                _ => self.blocks::<S, 1>(),
             }
         }
     }
@@ -88,9 +88,10 @@ impl Outer {
     #[inline(always)]
     unsafe fn blocks<S: Simd, const N: usize>(&self) {
         let (row_blocks, column_blocks) = (self.k.div_ceil(BLOCK), self.n.div_ceil(BLOCK));
+        let group = (RESIDENT / (BLOCK * self.rows.max(1))).max(2);
         let mut first = 0;
         while first < column_blocks {
-            let last = column_blocks.min(first + COLUMN_GROUP);
+            let last = column_blocks.min(first + group);
             for kb in 0..row_blocks {
                 for nb in first..last {
                     // SAFETY: block (kb, nb) lies inside `g`. An edge block goes to a zeroed copy first.

@@ -4,10 +4,6 @@ use super::simd::{Kernel, Simd, launch};
 use std::hint::black_box;
 use std::time::{Duration, Instant};
 
-/// Independent multiply-add chains: more than latency times throughput of any current core, and with the two factors
-/// still within 16 or 32 registers.
-const CHAINS_WIDE: usize = 20;
-const CHAINS_NARROW: usize = 12;
 /// Multiply-adds of each chain between two looks at the clock.
 const STEPS: usize = 20_000;
 
@@ -29,7 +25,7 @@ fn rate(isa: Isa, limit: Duration) -> f64 {
     let mut flops = 0.0;
     loop {
         // SAFETY: `isa` was detected, and the kernel touches no memory.
-        flops += unsafe { launch(isa, Chains) };
+        flops += unsafe { launch(isa, &Chains) };
         let elapsed = start.elapsed();
         if elapsed >= limit {
             return flops / elapsed.as_secs_f64() * 1e-9;
@@ -37,16 +33,23 @@ fn rate(isa: Isa, limit: Duration) -> f64 {
     }
 }
 
-/// Runs [`STEPS`] multiply-adds in every chain and returns the number of operations.
+/// Runs [`STEPS`] multiply-adds in every chain and returns the number of operations. There are more independent chains
+/// than latency times throughput of current cores, while chains and factors stay within the registers.
 struct Chains;
 
 impl Kernel for Chains {
     type Out = f64;
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) -> f64 {
+    unsafe fn run<S: Simd>(&self) -> f64 {
         // SAFETY: forwarded contract.
-        unsafe { if S::WIDE { chains::<S, CHAINS_WIDE>() } else { chains::<S, CHAINS_NARROW>() } }
+        unsafe {
+            match S::REGISTERS {
+                32.. => chains::<S, 20>(),
+                16.. => chains::<S, 12>(),
+                _ => chains::<S, 6>(),
+            }
+        }
     }
 }
 

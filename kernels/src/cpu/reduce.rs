@@ -11,7 +11,7 @@ use super::simd::{Kernel, Simd, launch};
 /// `isa.supported()`; `x` is valid for `[channels][rows]` with row stride `ldx`, and `acc` for `channels` values.
 pub unsafe fn rows_sum(isa: Isa, x: *const f32, ldx: usize, channels: usize, rows: usize, acc: *mut f32) {
     // SAFETY: forwarded contract.
-    unsafe { launch(isa, Reduce::<Sum> { x, ldx, channels, rows, acc, op: Sum }) }
+    unsafe { launch(isa, &Reduce::<Sum> { x, ldx, channels, rows, acc, op: Sum }) }
 }
 
 /// Raises `acc[c]` to the maximum of the first `rows` values of channel `c`, which hold no NaN.
@@ -20,7 +20,7 @@ pub unsafe fn rows_sum(isa: Isa, x: *const f32, ldx: usize, channels: usize, row
 /// As [`rows_sum`].
 pub unsafe fn rows_max(isa: Isa, x: *const f32, ldx: usize, channels: usize, rows: usize, acc: *mut f32) {
     // SAFETY: forwarded contract.
-    unsafe { launch(isa, Reduce::<Max> { x, ldx, channels, rows, acc, op: Max }) }
+    unsafe { launch(isa, &Reduce::<Max> { x, ldx, channels, rows, acc, op: Max }) }
 }
 
 /// An associative operation.
@@ -82,7 +82,7 @@ impl<C: Combine> Kernel for Reduce<C> {
     type Out = ();
 
     #[inline(always)]
-    unsafe fn run<S: Simd>(self) {
+    unsafe fn run<S: Simd>(&self) {
         for c in 0..self.channels {
             // SAFETY: `c < channels`.
             unsafe {

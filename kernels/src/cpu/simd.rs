@@ -12,8 +12,8 @@ use super::Isa;
 /// lanes that are accessed (no alignment is needed).
 pub(super) trait Simd {
     const LANES: usize;
-    /// Whether there are 32 vector registers rather than 16.
-    const WIDE: bool;
+    /// Vectors that fit into the registers at once.
+    const REGISTERS: usize;
     type V: Copy;
     /// One truth value per lane.
     type M: Copy;
@@ -103,15 +103,15 @@ pub(super) trait Kernel {
     ///
     /// # Safety
     /// The CPU has the instruction set of `S`, and the kernel's own contract holds.
-    unsafe fn run<S: Simd>(self) -> Self::Out;
+    unsafe fn run<S: Simd>(&self) -> Self::Out;
 }
 
-/// Runs `kernel` in a function compiled for `isa`.
+/// Runs `kernel` in a function compiled for `isa`. By reference: copying fresh arguments in wide pieces would stall.
 ///
 /// # Safety
 /// `isa.supported()`, and the kernel's own contract holds.
 #[inline]
-pub(super) unsafe fn launch<K: Kernel>(isa: Isa, kernel: K) -> K::Out {
+pub(super) unsafe fn launch<K: Kernel>(isa: Isa, kernel: &K) -> K::Out {
     debug_assert!(isa.supported(), "{isa} is not supported by this machine");
     match isa {
         // SAFETY: the caller vouches for `isa` and for the kernel's contract.
@@ -121,6 +121,6 @@ pub(super) unsafe fn launch<K: Kernel>(isa: Isa, kernel: K) -> K::Out {
         #[cfg(target_arch = "x86_64")]
         Isa::Avx2 => unsafe { super::simd_x86::run_avx2(kernel) },
         // SAFETY: the portable vectors need no CPU feature; the caller vouches for the kernel's contract.
-        _ => unsafe { kernel.run::<super::simd_portable::Portable>() },
+        _ => unsafe { super::simd_portable::run_portable(kernel) },
     }
 }

@@ -1,5 +1,15 @@
 //! Vectors as arrays of eight lanes, for targets without hand-picked instructions; the compiler vectorises the loops.
-use super::simd::Simd;
+use super::simd::{Kernel, Simd};
+
+/// Runs `kernel` with arrays; a function of its own, so that its stack frame does not burden the dispatch.
+///
+/// # Safety
+/// The kernel's contract holds.
+#[inline(never)]
+pub(super) unsafe fn run_portable<K: Kernel>(kernel: &K) -> K::Out {
+    // SAFETY: these vectors need no CPU feature; the caller vouches for the kernel's contract.
+    unsafe { kernel.run::<Portable>() }
+}
 
 /// Plain Rust lanes.
 pub(super) struct Portable;
@@ -69,7 +79,8 @@ fn floor(x: f32) -> f32 {
 
 impl Simd for Portable {
     const LANES: usize = LANES;
-    const WIDE: bool = false;
+    // The usual 128-bit registers hold half a vector.
+    const REGISTERS: usize = 8;
     type V = Lanes;
     type M = Lanes;
 
@@ -242,7 +253,8 @@ impl Simd for Portable {
 
     #[inline(always)]
     unsafe fn add_lane_sums<const N: usize>(acc: &[[Lanes; N]; 4], g: *mut f32) {
-        for (i, row) in acc.iter().enumerate() {
+        // Opaque, for the compiler would otherwise shuffle lanes inside the loop that accumulates.
+        for (i, row) in std::hint::black_box(*acc).iter().enumerate() {
             for (j, v) in row.iter().enumerate() {
                 let x = v.0.map(f32::from_bits);
                 let sum = ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]));

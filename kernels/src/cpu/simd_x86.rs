@@ -7,7 +7,7 @@ use std::arch::x86_64::*;
 /// # Safety
 /// The CPU has AVX-512 F, VL, DQ, BW, AVX2 and FMA, and the kernel's contract holds.
 #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
-pub(super) unsafe fn run_avx512<K: Kernel>(kernel: K) -> K::Out {
+pub(super) unsafe fn run_avx512<K: Kernel>(kernel: &K) -> K::Out {
     // SAFETY: forwarded contract.
     unsafe { kernel.run::<Avx512>() }
 }
@@ -17,7 +17,7 @@ pub(super) unsafe fn run_avx512<K: Kernel>(kernel: K) -> K::Out {
 /// # Safety
 /// The CPU has AVX2 and FMA, and the kernel's contract holds.
 #[target_feature(enable = "avx2,fma")]
-pub(super) unsafe fn run_avx2<K: Kernel>(kernel: K) -> K::Out {
+pub(super) unsafe fn run_avx2<K: Kernel>(kernel: &K) -> K::Out {
     // SAFETY: forwarded contract.
     unsafe { kernel.run::<Avx2>() }
 }
@@ -68,7 +68,7 @@ impl Avx512 {
 
 impl Simd for Avx512 {
     const LANES: usize = 16;
-    const WIDE: bool = true;
+    const REGISTERS: usize = 32;
     type V = __m512;
     type M = __mmask16;
 
@@ -185,7 +185,7 @@ impl Simd for Avx512 {
 unsafe fn sums_of_row(a: __m512, b: __m512, c: __m512, d: __m512) -> __m512 {
     // SAFETY: register operations of AVX-512.
     unsafe {
-        // [a0+a2 a1+a3 b2+b0 b3+b1] in every quarter, likewise for c and d; a blend is cheaper than a shuffle.
+        // [a0+a2 a1+a3 b2+b0 b3+b1] in every quarter, likewise for c and d.
         let ab = _mm512_add_ps(_mm512_mask_blend_ps(0xcccc, a, b), _mm512_shuffle_ps::<0b01_00_11_10>(a, b));
         let cd = _mm512_add_ps(_mm512_mask_blend_ps(0xcccc, c, d), _mm512_shuffle_ps::<0b01_00_11_10>(c, d));
         _mm512_add_ps(_mm512_shuffle_ps::<0b10_00_10_00>(ab, cd), _mm512_shuffle_ps::<0b11_01_11_01>(ab, cd))
@@ -216,7 +216,7 @@ impl Avx2 {
 
 impl Simd for Avx2 {
     const LANES: usize = 8;
-    const WIDE: bool = false;
+    const REGISTERS: usize = 16;
     type V = __m256;
     /// All bits of a lane set or clear.
     type M = __m256;

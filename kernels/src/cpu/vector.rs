@@ -1,7 +1,7 @@
 //! Scalar primitives on runs of lanes: one call applies one [`Prim`] to `len` lanes.
 //!
-//! Every primitive is compiled for every combination of operand kinds, so that a call costs one dispatch and the loop has
-//! no branches.
+//! Every primitive is compiled for every combination of operand kinds, so that a call costs one dispatch and the loop
+//! has no branches.
 use super::Isa;
 use super::math;
 use super::simd::{Kernel, Simd, launch};
@@ -26,17 +26,18 @@ impl Operand {
 /// Computes `out[i] = prim(operands[0][i], ...)` for `len` lanes; operands beyond the primitive's arity are ignored.
 ///
 /// # Safety
-/// `isa.supported()`; `out` and the used operands are valid for `len` lanes; `out` equals an operand's pointer or does not
-/// overlap it.
+/// `isa.supported()`; `out` and the used operands are valid for `len` lanes; `out` equals an operand's pointer or does
+/// not overlap it.
+#[inline]
 pub unsafe fn apply(isa: Isa, prim: Prim, out: *mut f32, operands: [Operand; 3], len: usize) {
     // SAFETY: forwarded contract.
-    unsafe { launch(isa, Apply { prim, out, operands, len }) }
+    unsafe { launch(isa, &Apply { prim, out, operands: &operands, len }) }
 }
 
-struct Apply {
+struct Apply<'a> {
     prim: Prim,
     out: *mut f32,
-    operands: [Operand; 3],
+    operands: &'a [Operand; 3],
     len: usize,
 }
 
@@ -61,11 +62,11 @@ macro_rules! primitives {
                 unsafe { $body }
             }
         })+)+
-        impl Kernel for Apply {
+        impl Kernel for Apply<'_> {
             type Out = ();
 
             #[inline(always)]
-            unsafe fn run<S: Simd>(self) {
+            unsafe fn run<S: Simd>(&self) {
                 match self.prim {
                     // SAFETY: forwarded contract of `apply`.
                     $($(Prim::$name => unsafe { self.$arity::<S, ops::$name>() },)+)+
@@ -174,7 +175,7 @@ impl Source for Value {
 /// Stands for an operand that the primitive does not have.
 const UNUSED: Value = Value(0);
 
-impl Apply {
+impl Apply<'_> {
     /// # Safety
     /// As [`apply`]; the same holds for the other methods.
     #[inline(always)]

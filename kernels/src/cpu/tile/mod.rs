@@ -1,0 +1,295 @@
+//! CPU tile programs: a region lowered to calls of the SIMD kernels.
+//!
+//! A tile is a stretch of the region's inner axis at one position of the outer axes. Every value of the region lives in
+//! a scratch arena that stays in the L2 cache: *full* values channel by channel with one lane a row, *uniform* values
+//! (which do not vary along the inner axis) one lane a channel. Picking channels costs nothing: a value is a list of
+//! places, and picks share them.
+
+mod allocate;
+mod flat;
+mod lower;
+mod run;
+mod values;
+
+pub use flat::{Flat, FlatArg, split_flat};
+pub use lower::lower;
+pub use run::{Chunk, Memory, pack, run_tiles};
+
+use raygrad_compiler::ops::Reduction;
+use raygrad_compiler::plan::region::{BufferId, Weights};
+use raygrad_compiler::scalar::Prim;
+
+/// Rows of a tile with layers: the activations of a few 256-wide layers stay in L2.
+const LAYER_ROWS: usize = 192;
+/// Rows of a tile without layers.
+const PLAIN_ROWS: usize = 1024;
+/// Chunks a launch is cut into at most. Fixed, so that sums do not depend on the number of threads.
+const MAX_CHUNKS: usize = 16;
+/// Channels from which an operand in pieces is multiplied piece by piece instead of being put together first.
+const WIDE: usize = 64;
+/// Lanes that a pointwise program works on at a time: its temporaries stay in L1.
+const BLOCK: usize = 512;
+
+/// How a buffer is addressed from a position of the domain: `channel * elements + outer . index + inner * row`.
+#[derive(Clone, Debug)]
+pub struct View {
+    pub buffer: BufferId,
+    /// Lanes between channels.
+    pub elements: usize,
+    /// Stride of every outer axis.
+    pub outer: Vec<usize>,
+    /// Stride of the inner axis; 0 where the buffer lacks it.
+    pub inner: usize,
+}
+
+/// Where a channel of a value starts in the scratch arena, in lanes.
+type Place = u32;
+
+/// A value in the scratch arena.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Value {
+    pub places: Vec<Place>,
+    /// Varies along the inner axis: one lane a row. Otherwise one lane.
+    pub full: bool,
+}
+
+/// An operand of a pointwise run.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum RunArg {
+    /// One lane for each lane of the run.
+    Lanes(Place),
+    /// One lane for all.
+    Splat(Place),
+}
+
+/// A pointwise program applied to consecutive lanes.
+#[derive(Clone, Debug)]
+pub struct Run {
+    pub out: Place,
+    /// Channels of the run; full channels are a row stride apart.
+    pub channels: usize,
+    pub args: Vec<RunArg>,
+}
+
+/// Where an instruction of a pointwise program reads.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Source {
+    Arg(u8),
+    Const(u32),
+    Temp(u8),
+}
+
+/// A scalar program with its temporaries assigned; the last instruction writes the run's output.
+#[derive(Clone, Debug)]
+pub struct LaneProgram {
+    pub code: Vec<(Prim, [Source; 3], u8)>,
+    pub temps: usize,
+}
+
+/// What happens to a layer's output before it is stored.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum LayerEpilogue {
+    None,
+    Relu,
+    /// Zero where the value at this place is not positive.
+    Mask(Place),
+}
+
+/// A layer on a tile.
+#[derive(Clone, Debug)]
+pub struct Layer {
+    pub x: Place,
+    pub contraction: usize,
+    /// Index of its packed weights.
+    pub pack: usize,
+    pub bias: Option<Place>,
+    /// Adds to what is there.
+    pub accumulate: bool,
+    pub epilogue: LayerEpilogue,
+    pub out: Place,
+    pub outputs: usize,
+    pub full: bool,
+}
+
+/// One operation on a tile.
+#[derive(Clone, Debug)]
+pub enum TileOp {
+    Load {
+        view: View,
+        to: Place,
+        channels: usize,
+        full: bool,
+    },
+    Map {
+        program: LaneProgram,
+        runs: Vec<Run>,
+        full: bool,
+    },
+    /// `out[j] = sum of from[group[j]]`, channel lists flattened.
+    ChannelSum {
+        from: Vec<Place>,
+        groups: Vec<Vec<u32>>,
+        out: Place,
+        full: bool,
+    },
+    ChannelMax {
+        from: Vec<Place>,
+        out: Place,
+        full: bool,
+    },
+    /// Puts channels next to each other for a kernel that needs them so.
+    Gather {
+        from: Vec<Place>,
+        from_full: Vec<bool>,
+        to: Place,
+        full: bool,
+    },
+    Layer(Layer),
+    RowLinear {
+        x: Value,
+        w: Value,
+        rows: usize,
+        columns: usize,
+        transposed: bool,
+        out: Place,
+        full: bool,
+    },
+    RowOuter {
+        x: Value,
+        d: Value,
+        out: Place,
+        full: bool,
+    },
+    CumSum {
+        from: Vec<Place>,
+        out: Place,
+        reverse: bool,
+    },
+    Shift {
+        from: Vec<Place>,
+        out: Place,
+        by: i64,
+    },
+    /// Position along an outer axis (by index) or the inner one.
+    Index {
+        outer: Option<usize>,
+        out: Place,
+    },
+    Take {
+        view: View,
+        axis_stride: usize,
+        axis_size: usize,
+        index: Value,
+        out: Place,
+        channels: usize,
+        full: bool,
+    },
+    SymEig {
+        n: usize,
+        from: Vec<Place>,
+        out: Place,
+        full: bool,
+    },
+    Store(TileStore),
+}
+
+/// How a tile's result reaches memory.
+#[derive(Clone, Debug)]
+pub enum TileStore {
+    Write {
+        value: Value,
+        view: View,
+    },
+    /// Combined into the chunk's accumulator at `at`, laid out like the buffer.
+    Reduce {
+        kind: Reduction,
+        value: Value,
+        view: View,
+        at: usize,
+    },
+    /// Blocked accumulators (see [`super::outer`]), one per element of the buffer, at `at`.
+    Outer {
+        /// Stretches of x: place, first channel, channels.
+        parts: Vec<(Place, usize, usize)>,
+        k: usize,
+        d: Place,
+        n: usize,
+        view: View,
+        at: usize,
+    },
+    Scatter {
+        value: Value,
+        index: Value,
+        axis_stride: usize,
+        axis_size: usize,
+        view: View,
+        at: usize,
+    },
+}
+
+/// An accumulator of a chunk, and what it becomes.
+#[derive(Clone, Debug)]
+pub struct Accumulator {
+    pub at: usize,
+    pub len: usize,
+    pub kind: Reduction,
+    pub buffer: BufferId,
+    /// `(k, n, elements)` of blocked outer products; plain sums are laid out like the buffer.
+    pub blocked: Option<(usize, usize, usize)>,
+}
+
+/// Weights to pack before a launch.
+#[derive(Clone, Debug)]
+pub struct Pack {
+    pub weights: Weights,
+    pub view: View,
+    /// Where the panels of the first element start, and how far apart elements are.
+    pub at: usize,
+    pub len: usize,
+    pub elements: usize,
+}
+
+/// A region as tile operations.
+#[derive(Clone, Debug)]
+pub struct TileProgram {
+    /// Sizes of the outer axes.
+    pub outer: Vec<usize>,
+    /// Size of the inner axis.
+    pub inner: usize,
+    /// Most rows of a tile, a multiple of [`super::ROW_BLOCK`].
+    pub rows: usize,
+    /// Lanes between channels of a full value.
+    pub ld: usize,
+    /// Lanes of scratch a thread needs, temporaries of pointwise programs included.
+    pub scratch: usize,
+    /// Where the temporaries of pointwise programs start.
+    pub temps: usize,
+    pub constants: Vec<(Place, u32)>,
+    pub ops: Vec<TileOp>,
+    pub packs: Vec<Pack>,
+    /// Lanes of packed weights.
+    pub packed: usize,
+    pub accumulators: Vec<Accumulator>,
+    /// Lanes of one chunk's accumulators.
+    pub accumulated: usize,
+    /// Reductions over the inner axis alone go straight to their buffer: chunks end where an outer position ends.
+    pub direct: bool,
+    pub chunks: usize,
+}
+
+impl TileProgram {
+    /// Tiles along the inner axis.
+    pub fn segments(&self) -> usize {
+        self.inner.div_ceil(self.rows)
+    }
+    /// Tiles in all.
+    pub fn tiles(&self) -> usize {
+        self.outer.iter().product::<usize>() * self.segments()
+    }
+    /// Tiles of chunk `c`.
+    pub fn chunk_tiles(&self, c: usize) -> std::ops::Range<usize> {
+        let unit = if self.direct { self.segments() } else { 1 };
+        let units = self.tiles() / unit;
+        c * units / self.chunks * unit..(c + 1) * units / self.chunks * unit
+    }
+}

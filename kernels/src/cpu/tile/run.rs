@@ -1,0 +1,514 @@
+//! Runs a tile program: packs weights, then works through the tiles of a chunk.
+
+use super::*;
+use crate::cpu::{Epilogue, Gemm, Isa, Operand, ROW_BLOCK, apply, gemm, outer, pack_panels, rows_max, rows_sum};
+use raygrad_compiler::ops::sym_eig::jacobi;
+
+/// Base addresses of a program's buffers, by [`BufferId`].
+#[derive(Clone, Copy)]
+pub struct Memory<'a> {
+    pub buffers: &'a [*mut f32],
+}
+
+// SAFETY: a `Memory` is only a list of addresses; every access through it is in an `unsafe fn` whose contract says that
+// threads touch disjoint lanes.
+unsafe impl Send for Memory<'_> {}
+// SAFETY: as above.
+unsafe impl Sync for Memory<'_> {}
+
+/// What a thread works with for one chunk.
+pub struct Chunk<'a> {
+    pub memory: Memory<'a>,
+    pub isa: Isa,
+    /// Packed weights of the launch.
+    pub packed: &'a [f32],
+    /// `TileProgram::scratch` lanes of this thread.
+    pub scratch: &'a mut [f32],
+    /// `TileProgram::accumulated` lanes of this chunk, zeros (or -inf for maxima).
+    pub accumulators: &'a mut [f32],
+}
+
+/// Packs one set of weights into `packed`.
+///
+/// # Safety
+/// The addresses of `memory` are those of the program's buffers, and nobody writes the weights meanwhile.
+pub unsafe fn pack(pack: &Pack, memory: Memory, packed: &mut [f32]) {
+    let w = &pack.weights;
+    let lanes = w.rows * w.columns;
+    let base = memory.buffers[w.buffer.0 as usize].wrapping_add(w.first * pack.elements);
+    for e in 0..pack.elements {
+        let panels = &mut packed[pack.at + e * pack.len..][..pack.len];
+        if pack.elements == 1 {
+            // SAFETY: the buffer holds the weights' channels one after the other, being of one element.
+            let matrix = unsafe { std::slice::from_raw_parts(base, lanes) };
+            pack_panels(matrix, w.rows, w.columns, w.transposed, panels);
+        } else {
+            // SAFETY: channel c of element e lies at c * elements + e.
+            let matrix: Vec<f32> = (0..lanes).map(|c| unsafe { *base.add(c * pack.elements + e) }).collect();
+            pack_panels(&matrix, w.rows, w.columns, w.transposed, panels);
+        }
+    }
+}
+
+/// Runs the tiles of chunk `c`.
+///
+/// # Safety
+/// `memory` holds the addresses of the program's buffers, all of the planned size; `chunk.isa` is supported; no other
+/// thread touches the lanes this chunk writes. Different chunks write different lanes, by construction of the plan.
+pub unsafe fn run_tiles(program: &TileProgram, c: usize, chunk: &mut Chunk) {
+    debug_assert!(chunk.scratch.len() >= program.scratch && chunk.accumulators.len() >= program.accumulated);
+    let scratch = chunk.scratch.as_mut_ptr();
+    for (place, bits) in &program.constants {
+        chunk.scratch[*place as usize] = f32::from_bits(*bits);
+    }
+    let segments = program.segments();
+    for t in program.chunk_tiles(c) {
+        let row0 = t % segments * program.rows;
+        let mut rest = t / segments;
+        let mut position = vec![0; program.outer.len()];
+        for (p, size) in position.iter_mut().zip(&program.outer).rev() {
+            *p = rest % size;
+            rest /= size;
+        }
+        let rows = program.rows.min(program.inner - row0);
+        let tile = Tile {
+            program,
+            memory: chunk.memory,
+            isa: chunk.isa,
+            packed: chunk.packed.as_ptr(),
+            accumulators: chunk.accumulators.as_mut_ptr(),
+            scratch,
+            row0,
+            rows,
+            padded: rows.next_multiple_of(ROW_BLOCK),
+            position: &position,
+        };
+        for op in &program.ops {
+            // SAFETY: the lowering places every value inside the scratch, and the caller vouches for the buffers.
+            unsafe { tile.run(op) };
+        }
+    }
+}
+
+struct Tile<'a> {
+    program: &'a TileProgram,
+    memory: Memory<'a>,
+    isa: Isa,
+    packed: *const f32,
+    accumulators: *mut f32,
+    scratch: *mut f32,
+    row0: usize,
+    rows: usize,
+    /// Rows rounded up for the matrix kernels.
+    padded: usize,
+    position: &'a [usize],
+}
+
+impl Tile<'_> {
+    fn at(&self, place: Place) -> *mut f32 {
+        self.scratch.wrapping_add(place as usize)
+    }
+
+    /// Lane of a buffer at the tile's first row, channel 0.
+    fn offset(&self, view: &View) -> usize {
+        self.position.iter().zip(&view.outer).map(|(p, s)| p * s).sum::<usize>() + self.row0 * view.inner
+    }
+
+    fn base(&self, view: &View) -> *mut f32 {
+        self.memory.buffers[view.buffer.0 as usize].wrapping_add(self.offset(view))
+    }
+
+    /// Lanes an operation works on, and the distance between output channels.
+    fn extent(&self, full: bool) -> (usize, usize) {
+        if full { (self.padded, self.program.ld) } else { (1, 1) }
+    }
+
+    /// Lane `row` of a value's channel, 0 for every row of a uniform one.
+    unsafe fn lane(&self, value: &Value, channel: usize, row: usize) -> f32 {
+        // SAFETY: places are inside the scratch, and a full channel has `ld` lanes.
+        unsafe { *self.at(value.places[channel]).add(if value.full { row } else { 0 }) }
+    }
+
+    /// # Safety
+    /// As [`run_tiles`].
+    unsafe fn run(&self, op: &TileOp) {
+        // SAFETY: every arm works on places that the lowering allocated with the extent used here, and on buffers
+        // through views that stay inside them for positions of the domain.
+        unsafe {
+            match op {
+                TileOp::Load { view, to, channels, full } => self.load(view, *to, *channels, *full),
+                TileOp::Map { program, runs, full } => self.map(program, runs, *full),
+                TileOp::ChannelSum { from, groups, out, full } => self.channel_sum(from, groups, *out, *full),
+                TileOp::ChannelMax { from, out, full } => {
+                    let (len, _) = self.extent(*full);
+                    let out = self.at(*out);
+                    std::ptr::copy(self.at(from[0]), out, len);
+                    for place in &from[1..] {
+                        self.apply(Prim::Max, out, out, self.at(*place), len);
+                    }
+                }
+                TileOp::Gather { from, from_full, to, full } => {
+                    let (len, step) = self.extent(*full);
+                    for (c, (place, is_full)) in from.iter().zip(from_full).enumerate() {
+                        let (source, to) = (self.at(*place), self.at(*to).add(c * step));
+                        if *is_full == *full {
+                            std::ptr::copy_nonoverlapping(source, to, len);
+                        } else {
+                            std::slice::from_raw_parts_mut(to, len).fill(*source);
+                        }
+                    }
+                }
+                TileOp::Layer(layer) => self.layer(layer),
+                TileOp::RowLinear { x, w, rows, columns, transposed, out, full } => {
+                    self.row_linear(x, w, (*rows, *columns), *transposed, *out, *full);
+                }
+                TileOp::RowOuter { x, d, out, full } => {
+                    let (len, step) = self.extent(*full);
+                    let n = d.places.len();
+                    for c in 0..x.places.len() * n {
+                        let (a, b) = (self.operand(x, c / n, *full), self.operand(d, c % n, *full));
+                        let out = self.at(*out).add(c * step);
+                        apply(self.isa, Prim::Mul, out, [a, b, Operand::Splat(0)], len);
+                    }
+                }
+                TileOp::CumSum { from, out, reverse } => self.cumsum(from, *out, *reverse),
+                TileOp::Shift { from, out, by } => self.shift(from, *out, *by),
+                TileOp::Index { outer, out } => {
+                    let out = self.at(*out);
+                    match outer {
+                        Some(axis) => *out = f32::from_bits(self.position[*axis] as u32),
+                        None => {
+                            for r in 0..self.padded {
+                                *out.add(r) = f32::from_bits((self.row0 + r) as u32);
+                            }
+                        }
+                    }
+                }
+                TileOp::Take { view, axis_stride, axis_size, index, out, channels, full } => {
+                    let (_, step) = self.extent(*full);
+                    let rows = if *full { self.rows } else { 1 };
+                    let base = self.base(view);
+                    for r in 0..self.extent(*full).0 {
+                        let slot = (self.lane(index, 0, r).to_bits() as usize).min(axis_size - 1);
+                        // Padding rows repeat the last one: they only have to stay inside the buffer.
+                        let from = base.add(slot * axis_stride + r.min(rows - 1) * view.inner);
+                        for c in 0..*channels {
+                            *self.at(*out).add(c * step + r) = *from.add(c * view.elements);
+                        }
+                    }
+                }
+                TileOp::SymEig { n, from, out, full } => self.sym_eig(*n, from, *out, *full),
+                TileOp::Store(store) => self.store(store),
+            }
+        }
+    }
+
+    unsafe fn apply(&self, prim: Prim, out: *mut f32, a: *const f32, b: *const f32, len: usize) {
+        // SAFETY: forwarded; the callers pass scratch places of `len` lanes.
+        unsafe { apply(self.isa, prim, out, [Operand::Lanes(a), Operand::Lanes(b), Operand::Splat(0)], len) }
+    }
+
+    unsafe fn operand(&self, value: &Value, channel: usize, full: bool) -> Operand {
+        let place = self.at(value.places[channel]);
+        // SAFETY: the place is inside the scratch.
+        if full && !value.full { Operand::Splat(unsafe { (*place).to_bits() }) } else { Operand::Lanes(place) }
+    }
+
+    unsafe fn load(&self, view: &View, to: Place, channels: usize, full: bool) {
+        let (len, step) = self.extent(full);
+        let rows = if full { self.rows } else { 1 };
+        let base = self.base(view);
+        for c in 0..channels {
+            // SAFETY: rows `row0..row0 + rows` are inside the buffer; padding rows are set, not read.
+            unsafe {
+                let (from, to) = (base.add(c * view.elements), self.at(to).add(c * step));
+                if rows == 1 || view.inner == 1 {
+                    std::ptr::copy_nonoverlapping(from, to, rows);
+                } else {
+                    for r in 0..rows {
+                        *to.add(r) = *from.add(r * view.inner);
+                    }
+                }
+                std::slice::from_raw_parts_mut(to.add(rows), len - rows).fill(0.0);
+            }
+        }
+    }
+
+    unsafe fn map(&self, program: &LaneProgram, runs: &[Run], full: bool) {
+        let temps = self.at(self.program.temps as Place);
+        for run in runs {
+            let lanes = if full { (run.channels - 1) * self.program.ld + self.padded } else { run.channels };
+            let mut start = 0;
+            while start < lanes {
+                let len = BLOCK.min(lanes - start);
+                let operand = |source: Source| match source {
+                    Source::Const(bits) => Operand::Splat(bits),
+                    Source::Temp(t) => Operand::Lanes(temps.wrapping_add(t as usize * BLOCK)),
+                    Source::Arg(a) => match run.args[a as usize] {
+                        RunArg::Lanes(place) => Operand::Lanes(self.at(place).wrapping_add(start)),
+                        // SAFETY: the place is inside the scratch.
+                        RunArg::Splat(place) => Operand::Splat(unsafe { (*self.at(place)).to_bits() }),
+                    },
+                };
+                for (i, (prim, sources, to)) in program.code.iter().enumerate() {
+                    let out = if i + 1 == program.code.len() {
+                        self.at(run.out).wrapping_add(start)
+                    } else {
+                        temps.wrapping_add(*to as usize * BLOCK)
+                    };
+                    // SAFETY: all operands have `len` lanes from `start`; an overwritten operand has the run's own places.
+                    unsafe { apply(self.isa, *prim, out, sources.map(operand), len) };
+                }
+                start += len;
+            }
+        }
+    }
+
+    unsafe fn channel_sum(&self, from: &[Place], groups: &[Vec<u32>], out: Place, full: bool) {
+        let (len, step) = self.extent(full);
+        for (j, group) in groups.iter().enumerate() {
+            let out = self.at(out).wrapping_add(j * step);
+            // SAFETY: places of `len` lanes; the output overlaps no operand.
+            unsafe {
+                match group.split_first() {
+                    None => std::slice::from_raw_parts_mut(out, len).fill(0.0),
+                    Some((first, rest)) => {
+                        std::ptr::copy_nonoverlapping(self.at(from[*first as usize]), out, len);
+                        for c in rest {
+                            self.apply(Prim::Add, out, out, self.at(from[*c as usize]), len);
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    unsafe fn layer(&self, layer: &Layer) {
+        let Layer { x, contraction, pack, bias, accumulate, epilogue, out, outputs, full } = *layer;
+        let pack = &self.program.packs[pack];
+        let element: usize = self.position.iter().zip(&pack.view.outer).map(|(p, s)| p * s).sum();
+        let panels = self.packed.wrapping_add(pack.at + element * pack.len);
+        if !full {
+            // One row: a dot product per output, straight from the panels.
+            for o in 0..outputs {
+                let panel =
+                    panels.wrapping_add(o / crate::cpu::panels::PANEL * contraction * crate::cpu::panels::PANEL);
+                let term = |k: usize| {
+                    // SAFETY: panel `o / 8` holds its 8 outputs for every step of the contraction; x has one lane a channel.
+                    unsafe {
+                        *panel.add(k * crate::cpu::panels::PANEL + o % crate::cpu::panels::PANEL) * *self.at(x).add(k)
+                    }
+                };
+                // SAFETY: the output has one lane a channel.
+                unsafe { *self.at(out).add(o) = (0..contraction).map(term).sum::<f32>() };
+            }
+            return;
+        }
+        let ld = self.program.ld;
+        let args = Gemm {
+            x: self.at(x),
+            ldx: ld,
+            contraction,
+            panels,
+            outputs,
+            bias: bias.map_or(std::ptr::null(), |b| self.at(b).cast_const()),
+            accumulate,
+            epilogue: match epilogue {
+                LayerEpilogue::None => Epilogue::None,
+                LayerEpilogue::Relu => Epilogue::Relu,
+                LayerEpilogue::Mask(h) => Epilogue::Mask { h: self.at(h), ldh: ld },
+            },
+            y: self.at(out),
+            ldy: ld,
+            rows: self.padded,
+        };
+        // SAFETY: the lowering places x, y, h and bias with these strides; y is a fresh place.
+        unsafe { gemm(self.isa, args) };
+    }
+
+    unsafe fn row_linear(&self, x: &Value, w: &Value, dims: (usize, usize), transposed: bool, out: Place, full: bool) {
+        let (rows, columns) = dims;
+        let (contraction, outputs) = if transposed { (columns, rows) } else { (rows, columns) };
+        let (len, step) = self.extent(full);
+        let product = self.at(self.program.temps as Place);
+        for o in 0..outputs {
+            let out = self.at(out).wrapping_add(o * step);
+            for k in 0..contraction {
+                let (row, column) = if transposed { (o, k) } else { (k, o) };
+                // SAFETY: scratch places of `len` lanes; the temporaries have room for a row of lanes.
+                unsafe {
+                    let (a, b) = (self.operand(x, k, full), self.operand(w, row * columns + column, full));
+                    let to = if k == 0 { out } else { product };
+                    apply(self.isa, Prim::Mul, to, [a, b, Operand::Splat(0)], len);
+                    if k > 0 {
+                        self.apply(Prim::Add, out, out, product, len);
+                    }
+                }
+            }
+        }
+    }
+
+    unsafe fn cumsum(&self, from: &[Place], out: Place, reverse: bool) {
+        for (c, place) in from.iter().enumerate() {
+            let (x, y) = (self.at(*place), self.at(out).wrapping_add(c * self.program.ld));
+            let mut sum = 0.0f32;
+            for i in 0..self.rows {
+                let r = if reverse { self.rows - 1 - i } else { i };
+                // SAFETY: rows of a full channel.
+                unsafe {
+                    *y.add(r) = sum;
+                    sum += *x.add(r);
+                }
+            }
+            // SAFETY: padding rows of the same channel.
+            unsafe { std::slice::from_raw_parts_mut(y.add(self.rows), self.padded - self.rows).fill(0.0) };
+        }
+    }
+
+    unsafe fn shift(&self, from: &[Place], out: Place, by: i64) {
+        for (c, place) in from.iter().enumerate() {
+            let (x, y) = (self.at(*place), self.at(out).wrapping_add(c * self.program.ld));
+            for r in 0..self.padded {
+                let source = r as i64 - by;
+                let inside = (0..self.rows as i64).contains(&source) && r < self.rows;
+                // SAFETY: rows of a full channel.
+                unsafe { *y.add(r) = if inside { *x.add(source as usize) } else { 0.0 } };
+            }
+        }
+    }
+
+    /// In f64 whatever the lanes are: rounding inside the iteration would be amplified by small gaps.
+    unsafe fn sym_eig(&self, n: usize, from: &[Place], out: Place, full: bool) {
+        let (len, step) = self.extent(full);
+        let rows = if full { self.rows } else { 1 };
+        for r in 0..len {
+            let lane = |c: &Place| {
+                // SAFETY: rows of the operand's channels; padding rows repeat the last one.
+                unsafe { *self.at(*c).add(r.min(rows - 1)) as f64 }
+            };
+            let matrix: Vec<f64> = from.iter().map(lane).collect();
+            let (values, vectors) = jacobi(&matrix, n);
+            for (c, x) in values.iter().chain(&vectors).enumerate() {
+                // SAFETY: rows of the output's channels.
+                unsafe { *self.at(out).add(c * step + r) = *x as f32 };
+            }
+        }
+    }
+
+    /// Accumulator of a store: the chunk's own, or the buffer itself where chunks end at outer positions.
+    fn accumulator(&self, view: &View, at: usize) -> *mut f32 {
+        if self.program.direct {
+            self.memory.buffers[view.buffer.0 as usize]
+        } else {
+            self.accumulators.wrapping_add(at)
+        }
+    }
+
+    unsafe fn store(&self, store: &TileStore) {
+        // SAFETY: views stay inside their buffers for positions of the domain; accumulators have the planned lengths.
+        unsafe {
+            match store {
+                TileStore::Write { value, view } => {
+                    let base = self.base(view);
+                    for c in 0..value.places.len() {
+                        let to = base.add(c * view.elements);
+                        if self.program.inner == 1 || !value.full {
+                            for r in 0..self.rows {
+                                *to.add(r * view.inner) = self.lane(value, c, r);
+                            }
+                        } else if view.inner == 1 {
+                            std::ptr::copy_nonoverlapping(self.at(value.places[c]), to, self.rows);
+                        } else {
+                            for r in 0..self.rows {
+                                *to.add(r * view.inner) = self.lane(value, c, r);
+                            }
+                        }
+                    }
+                }
+                TileStore::Reduce { kind, value, view, at } => self.reduce(*kind, value, view, *at),
+                TileStore::Outer { parts, k, d, n, view, at } => {
+                    let ld = self.program.ld;
+                    let rows = self.rows.next_multiple_of(16);
+                    let element: usize = self.position.iter().zip(&view.outer).map(|(p, s)| p * s).sum();
+                    let g = self.accumulators.add(at + element * crate::cpu::outer_len(*k, *n));
+                    self.clear_padding(*d, *n, rows);
+                    for (x, first, channels) in parts {
+                        self.clear_padding(*x, *channels, rows);
+                        let args = crate::cpu::Outer {
+                            x: self.at(*x),
+                            ldx: ld,
+                            k: *channels,
+                            d: self.at(*d),
+                            ldd: ld,
+                            n: *n,
+                            rows,
+                            g: g.add(crate::cpu::outer_len(*first, *n)),
+                        };
+                        outer(self.isa, args);
+                    }
+                }
+                TileStore::Scatter { value, index, axis_stride, axis_size, view, at } => {
+                    let base = self.accumulators.add(at + self.offset(view));
+                    for r in 0..self.rows {
+                        let slot = (self.lane(index, 0, r).to_bits() as usize).min(axis_size - 1);
+                        let to = base.add(slot * axis_stride + r * view.inner);
+                        for c in 0..value.places.len() {
+                            *to.add(c * view.elements) += self.lane(value, c, r);
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    /// Zeroes the padding of some channels up to `rows`: rows that are summed over must all count.
+    unsafe fn clear_padding(&self, first: Place, channels: usize, rows: usize) {
+        for c in 0..channels {
+            let padding = self.at(first).wrapping_add(c * self.program.ld + self.rows);
+            // SAFETY: a full channel has `ld` lanes, at least `rows`.
+            unsafe { std::slice::from_raw_parts_mut(padding, rows - self.rows).fill(0.0) };
+        }
+    }
+
+    unsafe fn reduce(&self, kind: Reduction, value: &Value, view: &View, at: usize) {
+        let base = self.accumulator(view, at).wrapping_add(self.offset(view));
+        let combine = |to: *mut f32, x: f32| {
+            // SAFETY: a lane of this chunk's accumulator.
+            unsafe {
+                match kind {
+                    Reduction::Sum => *to += x,
+                    Reduction::Max => *to = if x > *to { x } else { *to },
+                }
+            }
+        };
+        let ld = self.program.ld;
+        let side_by_side = value.places.windows(2).all(|w| w[1] - w[0] == ld as Place);
+        if view.inner == 0 && view.elements == 1 && value.full && side_by_side && kind == Reduction::Sum {
+            let x = self.at(value.places[0]);
+            // SAFETY: all channels at once: `rows` lanes each, `ld` apart, and as many accumulator lanes.
+            return unsafe { rows_sum(self.isa, x, ld, value.places.len(), self.rows, base) };
+        }
+        for c in 0..value.places.len() {
+            let to = base.wrapping_add(c * view.elements);
+            // SAFETY: `rows` lanes of a channel in the scratch.
+            unsafe {
+                if view.inner > 0 {
+                    for r in 0..self.rows {
+                        combine(to.add(r * view.inner), self.lane(value, c, r));
+                    }
+                } else if value.full {
+                    let mut total = if kind == Reduction::Sum { 0.0 } else { f32::NEG_INFINITY };
+                    let x = self.at(value.places[c]);
+                    match kind {
+                        Reduction::Sum => rows_sum(self.isa, x, self.program.ld, 1, self.rows, &mut total),
+                        Reduction::Max => rows_max(self.isa, x, self.program.ld, 1, self.rows, &mut total),
+                    }
+                    combine(to, total);
+                } else {
+                    let x = self.lane(value, c, 0);
+                    combine(to, if kind == Reduction::Sum { x * self.rows as f32 } else { x });
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,319 @@
+//! Layers of settings: a file, the `base` below it, assignments above it, each value with its origin.
+
+use super::error::{ConfigError, Origin};
+use super::presets::{PRESETS, Preset};
+use super::settings::Settings;
+use std::collections::BTreeMap;
+use std::path::Path;
+use toml::de::{DeTable, DeValue};
+use toml::{Spanned, Table, Value};
+
+/// Settings together with where each value came from.
+#[derive(Clone, Debug)]
+pub struct Layered {
+    /// Name of the preset, or stem of the file.
+    pub name: String,
+    pub settings: Settings,
+    table: Table,
+    origins: BTreeMap<String, Origin>,
+}
+
+impl Layered {
+    /// Loads a preset by name, or a file if `name` ends in `.toml`.
+    pub fn load(name: &str) -> Result<Layered, ConfigError> {
+        load(name, &mut vec![])
+    }
+
+    /// Sets one value; `text` is `section.key=value`, the value in TOML or a bare word.
+    pub fn set(&mut self, text: &str) -> Result<(), ConfigError> {
+        let refused = || ConfigError::NotAnAssignment { text: text.to_string() };
+        let (key, raw) = text.split_once('=').ok_or_else(refused)?;
+        let (key, raw) = (key.trim(), raw.trim());
+        if key.is_empty() {
+            return Err(refused());
+        }
+        self.assign(key, raw, Origin::Option(format!("--set {text}")))
+    }
+
+    /// Sets one value, given as it would be written in a file or as a bare word.
+    pub fn assign(&mut self, key: &str, raw: &str, origin: Origin) -> Result<(), ConfigError> {
+        if !self.has(key) {
+            return Err(unknown(origin, key, self.origins.keys()));
+        }
+        let word = Value::String(raw.to_string());
+        let parsed =
+            format!("v = {raw}").parse::<Table>().ok().filter(|t| t.len() == 1).and_then(|mut t| t.remove("v"));
+        match parsed {
+            None => self.put(key, word, origin),
+            // A path such as `2024` is a number in TOML, but a word where a word is due.
+            Some(value) => self.put(key, value, origin.clone()).or_else(|e| self.put(key, word, origin).map_err(|_| e)),
+        }
+    }
+
+    /// Where a value was set.
+    pub fn origin(&self, key: &str) -> Origin {
+        self.origins.get(key).cloned().unwrap_or_else(|| Origin::Option(self.name.clone()))
+    }
+
+    /// An error about the value of `key`.
+    pub fn refuse(&self, key: &str, message: impl Into<String>) -> ConfigError {
+        ConfigError::Value { origin: self.origin(key), key: key.to_string(), message: message.into() }
+    }
+
+    fn has(&self, key: &str) -> bool {
+        self.origins.contains_key(key)
+    }
+
+    /// Replaces one value, keeping the old one if the new one has the wrong type.
+    fn put(&mut self, key: &str, value: Value, origin: Origin) -> Result<(), ConfigError> {
+        let mut table = self.table.clone();
+        if let Some(slot) = slot(&mut table, key) {
+            *slot = value;
+        }
+        self.settings = parse(&table).map_err(|(field, message)| ConfigError::Value {
+            origin: origin.clone(),
+            key: if field.is_empty() { key.to_string() } else { field },
+            message,
+        })?;
+        self.table = table;
+        self.origins.insert(key.to_string(), origin);
+        Ok(())
+    }
+}
+
+fn load(name: &str, below: &mut Vec<String>) -> Result<Layered, ConfigError> {
+    let (label, file, text) = match Preset::find(name) {
+        Some(p) => (p.name.to_string(), format!("presets/{}.toml", p.name), p.text.to_string()),
+        None if name.ends_with(".toml") => {
+            let path = Path::new(name);
+            let text =
+                std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.into(), source })?;
+            let stem = path.file_stem().map_or(String::new(), |s| s.to_string_lossy().into_owned());
+            (stem, name.to_string(), text)
+        }
+        None => {
+            let nearest = nearest(name, PRESETS.iter().map(|p| p.name));
+            return Err(ConfigError::UnknownPreset { name: name.to_string(), nearest });
+        }
+    };
+    let lines = LineIndex::new(&file, &text);
+    let document = DeTable::parse(&text).map_err(|e| ConfigError::Syntax {
+        origin: lines.at(e.span().map_or(0, |s| s.start)),
+        message: e.message().to_string(),
+    })?;
+    let mut leaves = vec![];
+    flatten("", document.get_ref(), &lines, &mut leaves);
+    let base = leaves.iter().position(|l| l.key == "base").map(|i| leaves.remove(i));
+    below.push(name.to_string());
+    match base {
+        None => root(label, file, leaves),
+        Some(base) => {
+            let Value::String(base_name) = &base.value else {
+                let message = "expected the name of a preset or a file".to_string();
+                return Err(ConfigError::Value { origin: base.origin, key: base.key, message });
+            };
+            if below.contains(base_name) {
+                return Err(ConfigError::Cycle { origin: base.origin, name: base_name.clone() });
+            }
+            let mut layered = load(base_name, below)?;
+            for leaf in leaves {
+                if !layered.has(&leaf.key) {
+                    return Err(unknown(leaf.origin, &leaf.key, layered.origins.keys()));
+                }
+                layered.put(&leaf.key, leaf.value, leaf.origin)?;
+            }
+            layered.name = label;
+            Ok(layered)
+        }
+    }
+}
+
+/// A file without a base: it must set everything.
+fn root(name: String, file: String, leaves: Vec<Leaf>) -> Result<Layered, ConfigError> {
+    let known: Vec<String> = known_keys();
+    let (mut table, mut origins) = (Table::new(), BTreeMap::new());
+    for leaf in leaves {
+        if !known.contains(&leaf.key) {
+            return Err(unknown(leaf.origin, &leaf.key, known.iter()));
+        }
+        insert(&mut table, &leaf.key, leaf.value);
+        origins.insert(leaf.key, leaf.origin);
+    }
+    if let Some(key) = known.iter().find(|k| !origins.contains_key(*k)) {
+        return Err(ConfigError::Missing { file, key: key.clone() });
+    }
+    let settings = parse(&table).map_err(|(key, message)| {
+        let origin = origins.iter().find(|(k, _)| key.starts_with(*k)).map(|(_, o)| o.clone());
+        ConfigError::Value { origin: origin.unwrap_or(Origin::Line { file, line: 1 }), key, message }
+    })?;
+    Ok(Layered { name, settings, table, origins })
+}
+
+/// The keys of the preset that sets them all.
+fn known_keys() -> Vec<String> {
+    let text = PRESETS.iter().find(|p| !p.text.contains("\nbase ")).map_or("", |p| p.text);
+    let lines = LineIndex::new("", text);
+    let mut leaves = vec![];
+    if let Ok(document) = DeTable::parse(text) {
+        flatten("", document.get_ref(), &lines, &mut leaves);
+    }
+    leaves.into_iter().map(|l| l.key).collect()
+}
+
+struct Leaf {
+    key: String,
+    value: Value,
+    origin: Origin,
+}
+
+fn flatten(prefix: &str, table: &DeTable, lines: &LineIndex, into: &mut Vec<Leaf>) {
+    for (key, value) in table {
+        let path = if prefix.is_empty() { key.get_ref().to_string() } else { format!("{prefix}.{}", key.get_ref()) };
+        match value.get_ref() {
+            DeValue::Table(inner) => flatten(&path, inner, lines, into),
+            _ => into.push(Leaf { key: path, value: plain(value), origin: lines.at(key.span().start) }),
+        }
+    }
+}
+
+/// The value without spans.
+fn plain(value: &Spanned<DeValue>) -> Value {
+    match value.get_ref() {
+        DeValue::String(s) => Value::String(s.to_string()),
+        DeValue::Integer(n) => {
+            i64::from_str_radix(n.as_str(), n.radix()).map_or(Value::Float(f64::INFINITY), Value::Integer)
+        }
+        DeValue::Float(x) => x.as_str().parse().map_or(Value::Float(f64::NAN), Value::Float),
+        DeValue::Boolean(b) => Value::Boolean(*b),
+        DeValue::Datetime(d) => Value::Datetime(*d),
+        DeValue::Array(items) => Value::Array(items.iter().map(plain).collect()),
+        DeValue::Table(t) => Value::Table(t.iter().map(|(k, v)| (k.get_ref().to_string(), plain(v))).collect()),
+    }
+}
+
+fn insert(table: &mut Table, key: &str, value: Value) {
+    match key.split_once('.') {
+        None => {
+            table.insert(key.to_string(), value);
+        }
+        Some((section, rest)) => {
+            let inner = table.entry(section).or_insert_with(|| Value::Table(Table::new()));
+            if let Value::Table(inner) = inner {
+                insert(inner, rest, value);
+            }
+        }
+    }
+}
+
+fn slot<'a>(table: &'a mut Table, key: &str) -> Option<&'a mut Value> {
+    match key.split_once('.') {
+        None => table.get_mut(key),
+        Some((section, rest)) => slot(table.get_mut(section)?.as_table_mut()?, rest),
+    }
+}
+
+/// The settings, or the field that does not fit and why.
+fn parse(table: &Table) -> Result<Settings, (String, String)> {
+    serde_path_to_error::deserialize(Value::Table(table.clone())).map_err(|e| {
+        let path = e.path().to_string();
+        let message = e.into_inner().message().to_string();
+        let kinds = [("expected f64", "expected a number"), ("expected usize", "expected a whole number, 0 or more")];
+        let more = [
+            ("expected u32", "expected a whole number, 0 to 4294967295"),
+            ("expected a boolean", "expected true or false"),
+        ];
+        let message = kinds.iter().chain(&more).fold(message, |m, (from, to)| m.replace(from, to));
+        (path, message.trim().to_string())
+    })
+}
+
+fn unknown<'a>(origin: Origin, key: &str, known: impl Iterator<Item = &'a String>) -> ConfigError {
+    ConfigError::UnknownKey { origin, key: key.to_string(), nearest: nearest(key, known.map(String::as_str)) }
+}
+
+/// The candidate closest to what was written, by edit distance of the whole and of the last component, if it is close.
+pub fn nearest<'a>(written: &str, candidates: impl Iterator<Item = &'a str>) -> Option<String> {
+    let leaf = |s: &str| s.rsplit('.').next().unwrap_or_default().to_string();
+    let distance = |c: &str| {
+        let whole = strsim::damerau_levenshtein(written, c);
+        let last = 1 + strsim::damerau_levenshtein(&leaf(written), &leaf(c));
+        if c.contains('.') { whole.min(last) } else { whole }
+    };
+    let best = candidates.map(|c| (distance(c), c)).min()?;
+    (best.0 <= 2 + leaf(written).len() / 3).then(|| best.1.to_string())
+}
+
+/// Byte offsets to lines of a file.
+struct LineIndex<'a> {
+    file: &'a str,
+    starts: Vec<usize>,
+}
+
+impl LineIndex<'_> {
+    fn new<'a>(file: &'a str, text: &str) -> LineIndex<'a> {
+        LineIndex { file, starts: text.match_indices('\n').map(|(i, _)| i + 1).collect() }
+    }
+    fn at(&self, offset: usize) -> Origin {
+        Origin::Line { file: self.file.to_string(), line: 1 + self.starts.partition_point(|s| *s <= offset) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_preset_loads_and_survives_a_round_trip() {
+        for p in PRESETS {
+            let layered = Layered::load(p.name).unwrap_or_else(|e| panic!("{}: {e}", p.name));
+            layered.validate().unwrap_or_else(|e| panic!("{}: {e}", p.name));
+            let text = toml::to_string(&layered.settings).unwrap();
+            assert_eq!(toml::from_str::<Settings>(&text).unwrap(), layered.settings, "{}", p.name);
+            assert!(!p.summary().is_empty(), "{} needs a first comment", p.name);
+        }
+    }
+
+    #[test]
+    fn errors_name_origin_field_and_nearest_key() {
+        let mut l = Layered::load("planar-l2g").unwrap();
+        let error = |r: Result<(), ConfigError>| r.unwrap_err().to_string();
+        assert_eq!(
+            error(l.set("optim.stesp=3")),
+            "--set optim.stesp=3: unknown key `optim.stesp`; did you mean `optim.steps`?"
+        );
+        assert!(error(l.set("points_per_patch=3")).contains("did you mean `data.points_per_patch`?"));
+        assert!(
+            error(l.set("warp.dof=4")).contains("expected 1 (rotation), 2 (translation), 3 (rigid) or 8 (homography)")
+        );
+        assert!(error(l.set("optim.lr=fast")).contains("`optim.lr`: invalid type: string \"fast\", expected a number"));
+        assert!(error(l.set("steps")).contains("section.key=value"));
+        assert!(Layered::load("planar-l2g-smal").unwrap_err().to_string().contains("did you mean `planar-l2g-small`?"));
+        l.set("data.points_per_patch=4096").unwrap();
+        l.set("data.image=2024").unwrap();
+        l.set("optim.lr=1").unwrap();
+        assert_eq!((l.settings.data.image.as_str(), l.settings.optim.lr), ("2024", 1.0));
+        assert_eq!(l.settings.data.points_per_patch, super::super::Count::Of(4096));
+    }
+
+    #[test]
+    fn a_file_reports_its_lines() {
+        let dir = tempfile::tempdir().unwrap();
+        let write = |text: &str| {
+            let path = dir.path().join("mine.toml");
+            std::fs::write(&path, text).unwrap();
+            Layered::load(path.to_str().unwrap())
+        };
+        let error = |text: &str| write(text).unwrap_err().to_string();
+        assert!(
+            error("base = \"planar-l2g\"\n[optim]\nsteps = \"many\"\n")
+                .contains("mine.toml:3: `optim.steps`: invalid type")
+        );
+        assert!(
+            error("base = \"planar-l2g\"\n\n[optim]\nstep = 3\n").contains("mine.toml:4: unknown key `optim.step`")
+        );
+        assert!(error("base = \"planar-l2g\"\n[optim\n").contains("mine.toml:2: not valid TOML"));
+        assert!(error("[data]\npatches = 5\n").contains("missing `data.image`"));
+        let mine = write("base = \"planar-barf\"\n[optim]\nsteps = 7\n").unwrap();
+        assert_eq!((mine.settings.optim.steps, mine.name.as_str()), (7, "mine"));
+    }
+}

@@ -1,0 +1,45 @@
+//! The presets, embedded so that the command needs no files beside it.
+
+/// A built-in settings file.
+#[derive(Clone, Copy, Debug)]
+pub struct Preset {
+    pub name: &'static str,
+    pub text: &'static str,
+}
+
+impl Preset {
+    pub fn find(name: &str) -> Option<Preset> {
+        PRESETS.iter().copied().find(|p| p.name == name)
+    }
+    /// The comment at the top of the file, as one line.
+    pub fn summary(&self) -> String {
+        let lines = self.text.lines().map_while(|l| l.strip_prefix('#'));
+        lines.map(str::trim).collect::<Vec<_>>().join(" ")
+    }
+}
+
+macro_rules! presets {
+    ($($name:literal),* $(,)?) => {
+        /// Every preset, in the order in which `raygrad presets` lists them.
+        pub const PRESETS: &[Preset] =
+            &[$(Preset { name: $name, text: include_str!(concat!("../../../presets/", $name, ".toml")) }),*];
+    };
+}
+
+presets!(
+    "planar-l2g-small",
+    "planar-barf-small",
+    "planar-naive-small",
+    "planar-l2g",
+    "planar-barf",
+    "planar-naive",
+    "planar-noenc",
+    "planar-none",
+    "planar-l2g-noglobal",
+    "planar-barf-original",
+    "planar-l2g-rigid",
+    "planar-barf-rigid",
+    "planar-naive-rigid",
+    "planar-l2g-rotation",
+    "planar-l2g-translation",
+);

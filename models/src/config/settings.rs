@@ -1,0 +1,306 @@
+//! The settings of an experiment. Field docs are in `presets/planar-l2g.toml`, which sets every one of them.
+
+use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
+use std::fmt;
+use std::str::FromStr;
+
+/// Everything that determines a run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Settings {
+    pub data: Data,
+    pub noise: Noise,
+    pub warp: WarpSettings,
+    pub field: FieldSettings,
+    pub loss: Loss,
+    pub optim: Optim,
+    pub run: Run,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Data {
+    /// `builtin` or a file.
+    pub image: String,
+    pub image_size: ImageSize,
+    /// Rows, columns.
+    pub patch_crop: [usize; 2],
+    pub patches: usize,
+    pub points_per_patch: Count,
+    /// `drawn` or a file.
+    pub perturbation: String,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Noise {
+    pub kind: NoiseKind,
+    pub homography: f64,
+    pub rotation: f64,
+    pub translation: f64,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WarpSettings {
+    pub method: Method,
+    pub dof: Dof,
+    pub fix_first: bool,
+    pub code: usize,
+    pub layers: Vec<usize>,
+    pub skip: Vec<usize>,
+    pub solver: Solver,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FieldSettings {
+    pub layers: Vec<usize>,
+    pub bands: usize,
+    pub encoding: Encoding,
+    pub window: [f64; 2],
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Loss {
+    pub alignment: f64,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Optim {
+    pub steps: usize,
+    pub lr: f64,
+    pub lr_end: f64,
+    pub lr_warp: f64,
+    pub lr_warp_end: f64,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Run {
+    pub seed: u32,
+    pub device: DeviceChoice,
+    pub threads: Count,
+    pub log_every: usize,
+    pub picture_every: usize,
+    pub checkpoint_every: usize,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum NoiseKind {
+    L2g,
+    Barf,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Method {
+    None,
+    Global,
+    Local,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Solver {
+    InverseIteration,
+    Eigen,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Encoding {
+    None,
+    Full,
+    Windowed,
+}
+
+/// Which global transform a patch has, by its degrees of freedom.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(try_from = "u64", into = "u64")]
+pub enum Dof {
+    Rotation,
+    Translation,
+    Rigid,
+    Homography,
+}
+
+impl Dof {
+    pub fn count(self) -> usize {
+        match self {
+            Dof::Rotation => 1,
+            Dof::Translation => 2,
+            Dof::Rigid => 3,
+            Dof::Homography => 8,
+        }
+    }
+}
+
+impl From<Dof> for u64 {
+    fn from(dof: Dof) -> u64 {
+        dof.count() as u64
+    }
+}
+impl TryFrom<u64> for Dof {
+    type Error = String;
+    fn try_from(n: u64) -> Result<Dof, String> {
+        match n {
+            1 => Ok(Dof::Rotation),
+            2 => Ok(Dof::Translation),
+            3 => Ok(Dof::Rigid),
+            8 => Ok(Dof::Homography),
+            _ => Err(format!("expected 1 (rotation), 2 (translation), 3 (rigid) or 8 (homography), found {n}")),
+        }
+    }
+}
+impl fmt::Display for Dof {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str(match self {
+            Dof::Rotation => "rotation",
+            Dof::Translation => "translation",
+            Dof::Rigid => "rigid",
+            Dof::Homography => "homography",
+        })
+    }
+}
+
+/// A number or `"all"`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Count {
+    All,
+    Of(usize),
+}
+
+impl Count {
+    /// The number, given what "all" means.
+    pub fn of(self, all: usize) -> usize {
+        match self {
+            Count::All => all,
+            Count::Of(n) => n,
+        }
+    }
+    pub fn limit(self) -> Option<usize> {
+        match self {
+            Count::All => None,
+            Count::Of(n) => Some(n),
+        }
+    }
+}
+
+impl Serialize for Count {
+    fn serialize<S: Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
+        match self {
+            Count::All => s.serialize_str("all"),
+            Count::Of(n) => s.serialize_u64(*n as u64),
+        }
+    }
+}
+impl<'de> Deserialize<'de> for Count {
+    fn deserialize<D: Deserializer<'de>>(d: D) -> Result<Count, D::Error> {
+        struct Visitor;
+        impl de::Visitor<'_> for Visitor {
+            type Value = Count;
+            fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+                f.write_str("a whole number from 1 on, or \"all\"")
+            }
+            fn visit_i64<E: de::Error>(self, n: i64) -> Result<Count, E> {
+                match usize::try_from(n) {
+                    Ok(n) if n > 0 => Ok(Count::Of(n)),
+                    _ => Err(E::invalid_value(de::Unexpected::Signed(n), &self)),
+                }
+            }
+            fn visit_u64<E: de::Error>(self, n: u64) -> Result<Count, E> {
+                self.visit_i64(i64::try_from(n).unwrap_or(i64::MAX))
+            }
+            fn visit_str<E: de::Error>(self, s: &str) -> Result<Count, E> {
+                if s == "all" { Ok(Count::All) } else { Err(E::invalid_value(de::Unexpected::Str(s), &self)) }
+            }
+        }
+        d.deserialize_any(Visitor)
+    }
+}
+
+/// Rows and columns of the working grid.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ImageSize {
+    /// The photo's own size.
+    Photo,
+    /// Rows, columns.
+    Fixed([usize; 2]),
+}
+
+impl Serialize for ImageSize {
+    fn serialize<S: Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
+        match self {
+            ImageSize::Photo => s.serialize_str("photo"),
+            ImageSize::Fixed(size) => size.serialize(s),
+        }
+    }
+}
+impl<'de> Deserialize<'de> for ImageSize {
+    fn deserialize<D: Deserializer<'de>>(d: D) -> Result<ImageSize, D::Error> {
+        struct Visitor;
+        impl<'de> de::Visitor<'de> for Visitor {
+            type Value = ImageSize;
+            fn expecting(&self, f: &mut fmt::Formatter) -> fmt::Result {
+                f.write_str("[rows, columns], or \"photo\"")
+            }
+            fn visit_str<E: de::Error>(self, s: &str) -> Result<ImageSize, E> {
+                if s == "photo" { Ok(ImageSize::Photo) } else { Err(E::invalid_value(de::Unexpected::Str(s), &self)) }
+            }
+            fn visit_seq<A: de::SeqAccess<'de>>(self, seq: A) -> Result<ImageSize, A::Error> {
+                <[usize; 2]>::deserialize(de::value::SeqAccessDeserializer::new(seq)).map(ImageSize::Fixed)
+            }
+        }
+        d.deserialize_any(Visitor)
+    }
+}
+
+/// Where a run computes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DeviceChoice {
+    Auto,
+    Cpu,
+    /// The given adapter of `raygrad devices`, or the best one.
+    Wgpu(Option<usize>),
+}
+
+impl fmt::Display for DeviceChoice {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self {
+            DeviceChoice::Auto => f.write_str("auto"),
+            DeviceChoice::Cpu => f.write_str("cpu"),
+            DeviceChoice::Wgpu(None) => f.write_str("wgpu"),
+            DeviceChoice::Wgpu(Some(n)) => write!(f, "wgpu:{n}"),
+        }
+    }
+}
+impl FromStr for DeviceChoice {
+    type Err = String;
+    fn from_str(s: &str) -> Result<DeviceChoice, String> {
+        let refused =
+            || format!("expected `auto`, `cpu`, `wgpu` or `wgpu:N`, found `{s}`; `raygrad devices` lists them");
+        match s {
+            "auto" => Ok(DeviceChoice::Auto),
+            "cpu" => Ok(DeviceChoice::Cpu),
+            "wgpu" => Ok(DeviceChoice::Wgpu(None)),
+            _ => {
+                let n = s.strip_prefix("wgpu:").ok_or_else(refused)?;
+                n.parse().map(|n| DeviceChoice::Wgpu(Some(n))).map_err(|_| refused())
+            }
+        }
+    }
+}
+impl Serialize for DeviceChoice {
+    fn serialize<S: Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
+        s.collect_str(self)
+    }
+}
+impl<'de> Deserialize<'de> for DeviceChoice {
+    fn deserialize<D: Deserializer<'de>>(d: D) -> Result<DeviceChoice, D::Error> {
+        String::deserialize(d)?.parse().map_err(de::Error::custom)
+    }
+}

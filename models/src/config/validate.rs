@@ -1,0 +1,128 @@
+//! What single types cannot say about settings: ranges and values that must fit each other.
+
+use super::error::ConfigError;
+use super::layers::Layered;
+use super::settings::{Count, Encoding, ImageSize, Method, NoiseKind};
+
+/// Widest layer and most bands a configuration may ask for: more is a typing error, not an experiment.
+const MAX_WIDTH: usize = 4096;
+const MAX_BANDS: usize = 20;
+const MAX_SIDE: usize = 16384;
+
+impl Layered {
+    /// Checks every value that needs no other file.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        self.data()?;
+        self.networks()?;
+        self.numbers()?;
+        self.loss()
+    }
+
+    fn data(&self) -> Result<(), ConfigError> {
+        let d = &self.settings.data;
+        self.at_least("data.patches", d.patches, 1)?;
+        if self.settings.noise.kind == NoiseKind::Barf && d.patches > 5 {
+            let text = format!("the noise kind \"barf\" has shifts for at most 5 patches, found {}", d.patches);
+            return Err(self.refuse("data.patches", text));
+        }
+        let [rows, columns] = d.patch_crop;
+        if rows == 0 || columns == 0 || rows % 2 == 1 || columns % 2 == 1 {
+            let text = format!("a patch has an even number of rows and columns, found {rows} x {columns}");
+            return Err(self.refuse("data.patch_crop", text));
+        }
+        if let ImageSize::Fixed([h, w]) = d.image_size {
+            if h == 0 || w == 0 || h > MAX_SIDE || w > MAX_SIDE {
+                return Err(self
+                    .refuse("data.image_size", format!("expected 1 to {MAX_SIDE} rows and columns, found {h} x {w}")));
+            }
+            self.check_crop([h, w])?;
+        }
+        if let Count::Of(n) = d.points_per_patch {
+            // Four correspondences are the least that determine a homography.
+            self.at_least("data.points_per_patch", n, 4)?;
+        }
+        Ok(())
+    }
+
+    /// The patches must fit into an image of `size` rows and columns.
+    pub fn check_crop(&self, size: [usize; 2]) -> Result<(), ConfigError> {
+        let crop = self.settings.data.patch_crop;
+        if crop[0] > size[0] || crop[1] > size[1] {
+            let text = format!(
+                "a patch of {} x {} (rows x columns) is larger than the image of {} x {}",
+                crop[0], crop[1], size[0], size[1]
+            );
+            return Err(self.refuse("data.patch_crop", text));
+        }
+        Ok(())
+    }
+
+    fn networks(&self) -> Result<(), ConfigError> {
+        let (warp, field) = (&self.settings.warp, &self.settings.field);
+        for (key, layers) in [("warp.layers", &warp.layers), ("field.layers", &field.layers)] {
+            if layers.is_empty() || layers.iter().any(|n| *n == 0 || *n > MAX_WIDTH) {
+                let text = format!("expected at least one hidden layer, each 1 to {MAX_WIDTH} wide, found {layers:?}");
+                return Err(self.refuse(key, text));
+            }
+        }
+        if let Some(bad) = warp.skip.iter().find(|s| **s == 0 || **s > warp.layers.len()) {
+            let text =
+                format!("layer {bad} cannot skip: expected 1 to {}, the layers after the first", warp.layers.len());
+            return Err(self.refuse("warp.skip", text));
+        }
+        if warp.method == Method::Local && (warp.code == 0 || warp.code > MAX_WIDTH) {
+            return Err(self.refuse("warp.code", format!("expected 1 to {MAX_WIDTH} channels, found {}", warp.code)));
+        }
+        if field.encoding != Encoding::None && (field.bands == 0 || field.bands > MAX_BANDS) {
+            return Err(self.refuse("field.bands", format!("expected 1 to {MAX_BANDS} bands, found {}", field.bands)));
+        }
+        let [start, end] = field.window;
+        if !(0.0 <= start && start < end && end <= 1.0) {
+            let text = format!("expected [start, end] with 0 <= start < end <= 1, found [{start}, {end}]");
+            return Err(self.refuse("field.window", text));
+        }
+        Ok(())
+    }
+
+    fn numbers(&self) -> Result<(), ConfigError> {
+        let (optim, noise, run) = (&self.settings.optim, &self.settings.noise, &self.settings.run);
+        let rates = [
+            ("optim.lr", optim.lr),
+            ("optim.lr_end", optim.lr_end),
+            ("optim.lr_warp", optim.lr_warp),
+            ("optim.lr_warp_end", optim.lr_warp_end),
+        ];
+        for (key, value) in rates {
+            if !(value > 0.0 && value.is_finite()) {
+                return Err(self.refuse(key, format!("expected a learning rate above 0, found {value}")));
+            }
+        }
+        let deviations = [
+            ("noise.homography", noise.homography),
+            ("noise.rotation", noise.rotation),
+            ("noise.translation", noise.translation),
+        ];
+        for (key, value) in deviations {
+            if !(value >= 0.0 && value.is_finite()) {
+                return Err(self.refuse(key, format!("expected 0 or more, found {value}")));
+            }
+        }
+        self.at_least("optim.steps", optim.steps, 1)?;
+        if optim.steps > 1 << 24 {
+            return Err(self.refuse("optim.steps", format!("expected at most {}, found {}", 1 << 24, optim.steps)));
+        }
+        self.at_least("run.log_every", run.log_every, 1)
+    }
+
+    fn loss(&self) -> Result<(), ConfigError> {
+        let weight = self.settings.loss.alignment;
+        if weight >= 0.0 && weight.is_finite() {
+            return Ok(());
+        }
+        Err(self.refuse("loss.alignment", format!("expected a weight of 0 or more, found {weight}")))
+    }
+
+    fn at_least(&self, key: &str, value: usize, least: usize) -> Result<(), ConfigError> {
+        if value >= least { Ok(()) } else { Err(self.refuse(key, format!("expected {least} or more, found {value}"))) }
+    }
+}

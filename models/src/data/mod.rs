@@ -1,0 +1,9 @@
+//! Data of the experiments: photos, perturbations, and the random numbers of the host.
+
+pub mod perturbation;
+pub mod photo;
+pub mod random;
+
+pub use perturbation::{Perturbation, PerturbationError};
+pub use photo::{Photo, PhotoError};
+pub use random::Random;

@@ -1,0 +1,219 @@
+//! The graphs of planar registration: one training step, the evaluation over all pixels, and the picture learned.
+//!
+//! With patch points x, their colours c, the warp w_b of patch b and the field f:
+//!
+//! ```text
+//! y = w_b(x),   render = mean |f(y) - c|^2,   alignment = mean |y - T_b x|^2,   total = render + lambda alignment
+//! ```
+//!
+//! T_b is the closed-form fit of y to x. The step trains on all pixels, or on some drawn anew in every step.
+
+use super::rates::{BIAS1, BIAS2, LR_FIELD, LR_WARP, PROGRESS, STEP};
+use crate::config::{Count, Settings};
+use crate::fields::NeuralImage;
+use crate::geometry::Grid;
+use crate::warps::{self, Points, Registration, Warp};
+use raygrad_compiler::autodiff::grad;
+use raygrad_compiler::functions::adam::{Adam, Moments, StepScalars};
+use raygrad_compiler::functions::loss::mean_squared_error;
+use raygrad_compiler::functions::mlp::Parameter;
+use raygrad_compiler::ops::input::Role;
+use raygrad_compiler::ops::random;
+use raygrad_compiler::scalar::DType;
+use raygrad_compiler::{Axes, Axis, Channels, Shape, Step, Tensor};
+use std::sync::Arc;
+
+/// Coordinates of the patch pixels, `[pixel] x 2`.
+pub const GRID: &str = "data.grid";
+/// Colours of the distorted patches, `[frame, pixel] x 3`.
+pub const TARGET: &str = "data.target";
+/// Coordinates at which [`PlanarModel::picture`] looks, `[view] x 2`.
+pub fn view(pixels: usize) -> String {
+    format!("data.view.{pixels}")
+}
+/// What tells the pixel draws of two seeds apart.
+pub const SEED: &str = "data.seed";
+
+/// Stream of the pixel draws.
+const DRAW: u32 = 1;
+
+/// Field, warp and codes, and how they make a step.
+#[derive(Clone, Debug)]
+pub struct PlanarModel {
+    pub settings: Settings,
+    pub grid: Grid,
+    warp: Arc<dyn Warp>,
+    field: NeuralImage,
+    frame: Axis,
+    pixel: Axis,
+    code: Option<Parameter>,
+}
+
+impl PlanarModel {
+    pub fn new(settings: &Settings, grid: Grid, warp: Arc<dyn Warp>) -> PlanarModel {
+        let frame = Axis::new("frame", settings.data.patches);
+        let pixel = Axis::new("pixel", grid.crop_pixels());
+        let code = warps::codes(&*warp, &frame);
+        let field = NeuralImage::new(&settings.field);
+        PlanarModel { settings: settings.clone(), grid, warp, field, frame, pixel, code }
+    }
+
+    /// Everything that is trained.
+    pub fn parameters(&self) -> Vec<Parameter> {
+        self.field.parameters().into_iter().chain(self.warp_parameters()).collect()
+    }
+
+    fn warp_parameters(&self) -> impl Iterator<Item = Parameter> {
+        self.code.clone().into_iter().chain(self.warp.parameters())
+    }
+
+    /// Points of every patch in one training step.
+    pub fn points_per_patch(&self) -> usize {
+        self.settings.data.points_per_patch.of(self.grid.crop_pixels())
+    }
+
+    /// Floating-point operations of one training step in the networks: six a weight and row, for the forward pass and
+    /// the two products of the backward pass.
+    pub fn flops(&self) -> f64 {
+        let rows = self.settings.data.patches * self.points_per_patch();
+        6.0 * rows as f64 * (weights(&self.parameters())) as f64
+    }
+
+    /// One training step: outputs `render`, `total`, `transform` and, where the warp has
+    /// one, `alignment`; and an update of every parameter.
+    #[track_caller]
+    pub fn train_step(&self) -> Step {
+        let (at, target) = match self.settings.data.points_per_patch {
+            Count::All => (self.all_points(), self.target()),
+            Count::Of(points) => self.drawn_points(points),
+        };
+        let (found, render) = self.losses(&at, &target);
+        let total = self.total(&found, &render);
+        Step { outputs: losses_and_transform(&found, render, &total), updates: self.updates(&total) }
+    }
+
+    /// The same losses over all pixels of the patches, with the fields of both maps: `local` and `global` points and
+    /// `color`, `[frame, pixel]` each.
+    #[track_caller]
+    pub fn evaluation(&self) -> Step {
+        let at = self.all_points();
+        let found = self.register(&at);
+        let color = self.field.color(&found.local, &progress());
+        let render = mean_squared_error(&color, &self.target());
+        let total = self.total(&found, &render);
+        let fields = [("local", &found.local), ("global", &found.global), ("color", &color)];
+        let all = Axes::new([self.frame.clone(), self.pixel.clone()]);
+        let fields = fields.map(|(name, t)| (name.to_string(), t.broadcast_to(&all)));
+        let outputs = losses_and_transform(&found, render, &total).into_iter().chain(fields).collect();
+        Step { outputs, updates: vec![] }
+    }
+
+    /// The learned picture at `pixels` points: output `color`.
+    #[track_caller]
+    pub fn picture(&self, pixels: usize) -> Step {
+        let view = Tensor::data(view(pixels), Shape::new(&[&Axis::new("view", pixels)], 2));
+        let color = self.field.color(&view, &progress());
+        Step { outputs: vec![("color".to_string(), color)], updates: vec![] }
+    }
+
+    #[track_caller]
+    fn losses(&self, at: &Points, target: &Tensor) -> (Registration, Tensor) {
+        let found = self.register(at);
+        let color = self.field.color(&found.local, &progress());
+        let render = mean_squared_error(&color, target);
+        (found, render)
+    }
+
+    /// A weight of zero removes the alignment term: its gradient is not even computed.
+    #[track_caller]
+    fn total(&self, found: &Registration, render: &Tensor) -> Tensor {
+        let weight = self.settings.loss.alignment;
+        match &found.residual {
+            Some(residual) if weight > 0.0 => render + residual * weight,
+            _ => render.clone(),
+        }
+    }
+
+    #[track_caller]
+    fn register(&self, at: &Points) -> Registration {
+        let none = Tensor::scalar(0.0);
+        let code = self.code.as_ref().map_or(&none, |c| &c.tensor);
+        Registration::new(&*self.warp, at, code, self.settings.warp.fix_first)
+    }
+
+    #[track_caller]
+    fn all_points(&self) -> Points {
+        let xy = Tensor::data(GRID, Shape::new(&[&self.pixel], 2));
+        Points { frame: self.frame.clone(), point: self.pixel.clone(), xy }
+    }
+
+    #[track_caller]
+    fn target(&self) -> Tensor {
+        Tensor::data(TARGET, Shape::new(&[&self.frame, &self.pixel], 3))
+    }
+
+    /// `points` pixels a patch: the patch is cut into that many runs of pixels, and one is drawn from each.
+    #[track_caller]
+    fn drawn_points(&self, points: usize) -> (Points, Tensor) {
+        let point = Axis::new("point", points);
+        let seed = Tensor::data(SEED, Shape::new(&[], 1).with_dtype(DType::U32));
+        let step = Tensor::per_step(STEP, Shape::new(&[], 1).with_dtype(DType::U32));
+        let jitter =
+            random::uniform(&Axes::new([self.frame.clone(), point.clone()]), 1, DRAW, &step.wrapping_add(&seed));
+        let pixels = self.pixel.size() as f64;
+        let position = (Tensor::index(&point).to_f32() + jitter) * (pixels / points as f64);
+        let index = position.clamp(0.0, pixels - 1.0).to_u32();
+        let all = self.all_points();
+        let xy = all.xy.take(&index, &self.pixel);
+        (Points { frame: all.frame, point, xy }, self.target().take(&index, &self.pixel))
+    }
+
+    /// Adam on every parameter; field and warp have learning rates of their own.
+    #[track_caller]
+    fn updates(&self, total: &Tensor) -> Vec<(Tensor, Tensor)> {
+        let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
+        let scalars = |lr| StepScalars { lr: scalar(lr), bias1: scalar(BIAS1), bias2: scalar(BIAS2) };
+        let (of_field, of_warp) = (scalars(LR_FIELD), scalars(LR_WARP));
+        let all: Vec<(Tensor, &StepScalars)> = (self.field.parameters().into_iter().map(|p| (p.tensor, &of_field)))
+            .chain(self.warp_parameters().map(|p| (p.tensor, &of_warp)))
+            .collect();
+        let gradients = grad(total, &all.iter().map(|(p, _)| p).collect::<Vec<_>>());
+        let mut updates = vec![];
+        for ((parameter, scalars), gradient) in all.iter().zip(&gradients) {
+            let old = Moments::of(parameter);
+            let (mut value, new) = Adam::default().update(parameter, gradient, &old, scalars);
+            if self.is_reset(parameter) {
+                let first = Tensor::index(&self.frame).equal(&Tensor::integers(&[0]));
+                value = first.select(&Tensor::scalar(0.0), &value);
+            }
+            updates.extend([(parameter.clone(), value), (old.m, new.m), (old.v, new.v)]);
+        }
+        updates
+    }
+
+    /// Whether the gauge resets the first row of this parameter after the step.
+    fn is_reset(&self, parameter: &Tensor) -> bool {
+        let is_code = self.code.as_ref().is_some_and(|c| c.tensor.id() == parameter.id());
+        is_code && self.settings.warp.fix_first && self.warp.zero_code_is_identity()
+    }
+}
+
+#[track_caller]
+fn progress() -> Tensor {
+    Tensor::input(PROGRESS, Role::PerStep, Shape::new(&[], 1))
+}
+
+fn losses_and_transform(found: &Registration, render: Tensor, total: &Tensor) -> Vec<(String, Tensor)> {
+    let mut outputs = vec![("render", render), ("total", total.clone()), ("transform", found.transform.clone())];
+    outputs.extend(found.residual.clone().map(|r| ("alignment", r)));
+    outputs.into_iter().map(|(name, t)| (name.to_string(), t)).collect()
+}
+
+/// Entries of all weight matrices among the parameters, biases and codes left out.
+pub fn weights(parameters: &[Parameter]) -> usize {
+    let matrix = |p: &Parameter| match p.tensor.channels() {
+        Channels::Matrix(rows, columns) => rows * columns,
+        Channels::Vector(_) => 0,
+    };
+    parameters.iter().map(matrix).sum()
+}

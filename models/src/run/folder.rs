@@ -1,0 +1,201 @@
+//! The run folder: which run it holds, and that nothing of another run is overwritten.
+
+use super::files::{WriteError, write_atomically};
+use crate::config::{ConfigError, Count, DeviceChoice, Layered, Settings};
+use std::path::{Path, PathBuf};
+
+/// Name of the resolved settings, which mark a folder as a run's.
+pub const CONFIG: &str = "config.toml";
+
+/// Why a folder cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum FolderError {
+    #[error(transparent)]
+    Write(#[from] WriteError),
+    #[error("{} is not a folder", .path.display())]
+    NotAFolder { path: PathBuf },
+    #[error("cannot use the folder {}: {source}", .path.display())]
+    Access { path: PathBuf, source: std::io::Error },
+    #[error("the folder {} is not empty and holds no raygrad run; give another with `--out`", .path.display())]
+    Foreign { path: PathBuf },
+    #[error(
+        "the folder {} holds another run{}; give another with `--out`{}",
+        .path.display(),
+        .difference.as_ref().map_or(String::new(), |d| format!(" ({d})")),
+        if .difference.is_none() { ", or continue it with `--resume`" } else { "" }
+    )]
+    Occupied { path: PathBuf, difference: Option<String> },
+    #[error("nothing to resume: {} holds no checkpoint", .path.display())]
+    NothingToResume { path: PathBuf },
+    #[error("{} cannot be read back: {source}", .path.display())]
+    Config { path: PathBuf, source: Box<ConfigError> },
+}
+
+/// A folder that belongs to one run.
+#[derive(Debug)]
+pub struct RunFolder {
+    path: PathBuf,
+    /// Folders made for this run, innermost first, removed again if the run does not begin.
+    made: Vec<PathBuf>,
+    /// Files written before the run began, removed likewise.
+    written: std::cell::RefCell<Vec<PathBuf>>,
+    kept: bool,
+}
+
+impl RunFolder {
+    /// The folder a run gets if none is asked for: `runs/NAME`, then `runs/NAME-2`, ...: the first free one, or to
+    /// resume, the last that is there.
+    pub fn default_path(name: &str, resume: bool) -> PathBuf {
+        let nth = |n: usize| Path::new("runs").join(if n == 1 { name.to_string() } else { format!("{name}-{n}") });
+        let free = (1..).map(nth).position(|p| !p.exists()).unwrap_or(0) + 1;
+        nth(if resume { (free - 1).max(1) } else { free })
+    }
+
+    /// Claims an empty or new folder. Nothing is written yet.
+    pub fn claim(path: &Path, settings: &Settings) -> Result<RunFolder, FolderError> {
+        if path.exists() {
+            match RunFolder::held_settings(path)? {
+                Some(held) => {
+                    let (path, difference) = (path.to_path_buf(), difference(&held, settings));
+                    return Err(FolderError::Occupied { path, difference });
+                }
+                None if is_empty(path)? => {}
+                None => return Err(FolderError::Foreign { path: path.to_path_buf() }),
+            }
+        }
+        Ok(RunFolder { path: path.to_path_buf(), made: vec![], written: Default::default(), kept: false })
+    }
+
+    /// Opens the folder of the same run again.
+    pub fn reopen(path: &Path, settings: &Settings) -> Result<RunFolder, FolderError> {
+        let missing = || FolderError::NothingToResume { path: path.to_path_buf() };
+        if !path.exists() {
+            return Err(missing());
+        }
+        let held = RunFolder::held_settings(path)?.ok_or_else(missing)?;
+        match difference(&held, settings) {
+            None => Ok(RunFolder { path: path.to_path_buf(), made: vec![], written: Default::default(), kept: true }),
+            difference => Err(FolderError::Occupied { path: path.to_path_buf(), difference }),
+        }
+    }
+
+    /// Settings of the run in a folder, if it holds one.
+    pub fn held_settings(path: &Path) -> Result<Option<Settings>, FolderError> {
+        if !path.is_dir() {
+            return Err(FolderError::NotAFolder { path: path.to_path_buf() });
+        }
+        let config = path.join(CONFIG);
+        if !config.exists() {
+            return Ok(None);
+        }
+        match Layered::load(&config.to_string_lossy()) {
+            Ok(layered) => Ok(Some(layered.settings)),
+            Err(source) => Err(FolderError::Config { path: config, source: Box::new(source) }),
+        }
+    }
+
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Makes the folder and writes the resolved settings; if even that fails, the folder goes away again.
+    pub fn start(&mut self, settings: &Settings) -> Result<(), FolderError> {
+        for folder in self.path.ancestors().filter(|p| !p.as_os_str().is_empty()).take_while(|p| !p.exists()) {
+            self.made.push(folder.to_path_buf());
+        }
+        std::fs::create_dir_all(&self.path)
+            .map_err(|source| FolderError::Access { path: self.path.clone(), source })?;
+        let text = toml::to_string(settings).unwrap_or_default();
+        Ok(self.write(CONFIG, text.as_bytes())?)
+    }
+
+    /// From here on the folder stays, whatever happens.
+    pub fn keep(&mut self) {
+        self.kept = true;
+    }
+
+    /// Writes one file of the run.
+    pub fn write(&self, name: &str, bytes: &[u8]) -> Result<(), WriteError> {
+        let path = self.path.join(name);
+        if let Some(parent) = path.parent() {
+            std::fs::create_dir_all(parent).map_err(|source| WriteError { path: path.clone(), source })?;
+        }
+        write_atomically(&path, bytes)?;
+        if !self.kept {
+            self.written.borrow_mut().push(path);
+        }
+        Ok(())
+    }
+}
+
+impl Drop for RunFolder {
+    fn drop(&mut self) {
+        if self.kept {
+            return;
+        }
+        // Only what this run made: a failure to tidy up is no news.
+        for file in self.written.borrow().iter() {
+            let _ = std::fs::remove_file(file);
+        }
+        for folder in &self.made {
+            let _ = std::fs::remove_dir(folder);
+        }
+    }
+}
+
+fn is_empty(path: &Path) -> Result<bool, FolderError> {
+    let mut entries =
+        std::fs::read_dir(path).map_err(|source| FolderError::Access { path: path.to_path_buf(), source })?;
+    Ok(entries.next().is_none())
+}
+
+/// The first setting in which two runs differ. Where a run computes is not part of what it is.
+pub fn difference(held: &Settings, wanted: &Settings) -> Option<String> {
+    let flat = |s: &Settings| {
+        let mut s = s.clone();
+        (s.run.device, s.run.threads) = (DeviceChoice::Auto, Count::All);
+        let mut leaves = vec![];
+        if let Ok(table) = toml::Table::try_from(&s) {
+            for (section, values) in table {
+                for (key, value) in values.as_table().cloned().unwrap_or_default() {
+                    leaves.push((format!("{section}.{key}"), value));
+                }
+            }
+        }
+        leaves
+    };
+    let differs = flat(held).into_iter().zip(flat(wanted)).find(|(a, b)| a != b);
+    differs.map(|((key, held), (_, wanted))| format!("there `{key}` is {held}, here {wanted}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn another_run_is_never_overwritten() {
+        let dir = tempfile::tempdir().unwrap();
+        let settings = Layered::load("planar-l2g").unwrap().settings;
+        let mut other = settings.clone();
+        other.optim.steps = 7;
+        let path = dir.path().join("a/b");
+        drop(RunFolder::claim(&path, &settings).unwrap());
+        assert!(!path.exists());
+        let mut folder = RunFolder::claim(&path, &settings).unwrap();
+        folder.start(&settings).unwrap();
+        drop(folder);
+        assert!(!dir.path().join("a").exists(), "a run that wrote nothing leaves nothing");
+        let mut folder = RunFolder::claim(&path, &settings).unwrap();
+        folder.start(&settings).unwrap();
+        folder.keep();
+        let error = |r: Result<RunFolder, FolderError>| r.unwrap_err().to_string();
+        assert!(error(RunFolder::claim(&path, &settings)).contains("--resume"));
+        let text = error(RunFolder::claim(&path, &other));
+        assert!(text.contains("there `optim.steps` is 5000, here 7"), "{text}");
+        assert!(RunFolder::reopen(&path, &settings).is_ok());
+        assert!(error(RunFolder::reopen(&path, &other)).contains("optim.steps"));
+        std::fs::remove_file(path.join(CONFIG)).unwrap();
+        std::fs::write(path.join("thesis.tex"), "x").unwrap();
+        assert!(error(RunFolder::claim(&path, &settings)).contains("not empty"));
+    }
+}

@@ -1,0 +1,11 @@
+//! What a run leaves behind: its folder, metrics and checkpoints, and how it tells of its progress.
+
+pub mod checkpoint;
+pub mod files;
+pub mod folder;
+pub mod metrics;
+pub mod results;
+
+pub use checkpoint::{Checkpoint, CheckpointError};
+pub use folder::{FolderError, RunFolder};
+pub use metrics::{Entry, Final, Metrics};

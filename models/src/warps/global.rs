@@ -1,0 +1,60 @@
+//! One transform a frame, its Lie-algebra coordinates trained directly (BARF, ICCV 2021; naive without its window).
+//!
+//! | dof | code | transform |
+//! |---|---|---|
+//! | 1 | angle | rotation about the origin |
+//! | 2 | (t_x, t_y) | translation |
+//! | 3 | (u_x, u_y, angle) | SE(2) exponential |
+//! | 8 | h1 .. h8 | SL(3) exponential |
+
+use super::fit::affine;
+use super::{Points, Warp};
+use crate::config::Dof;
+use raygrad_compiler::functions::lie::{se2_exp, sl3_exp, so2_exp};
+use raygrad_compiler::functions::matrix::{apply, apply_affine, apply_homography};
+use raygrad_compiler::functions::mlp::Init;
+use raygrad_compiler::{Axis, Tensor};
+
+/// A transform of `dof` degrees of freedom a frame.
+#[derive(Clone, Copy, Debug)]
+pub struct GlobalWarp {
+    pub dof: Dof,
+}
+
+impl Warp for GlobalWarp {
+    fn map(&self, at: &Points, code: &Tensor) -> Tensor {
+        move_points(self.dof, code, &at.xy)
+    }
+    fn code_width(&self) -> usize {
+        self.dof.count()
+    }
+    fn code_init(&self) -> Init {
+        Init::Zero
+    }
+    fn global(&self, _: &Axis, code: &Tensor) -> Option<Tensor> {
+        let part = match self.dof {
+            Dof::Rotation => so2_exp(code),
+            Dof::Translation => code.clone(),
+            Dof::Rigid => se2_exp(code),
+            Dof::Homography => sl3_exp(code),
+        };
+        Some(affine(&part, self.dof))
+    }
+    fn dof(&self) -> Dof {
+        self.dof
+    }
+    fn zero_code_is_identity(&self) -> bool {
+        true
+    }
+}
+
+/// `points` under the transform whose coordinates are the channels of `code`.
+#[track_caller]
+pub(super) fn move_points(dof: Dof, code: &Tensor, points: &Tensor) -> Tensor {
+    match dof {
+        Dof::Rotation => apply(&so2_exp(code), points),
+        Dof::Translation => points + code,
+        Dof::Rigid => apply_affine(&se2_exp(code), points),
+        Dof::Homography => apply_homography(&sl3_exp(code), points),
+    }
+}

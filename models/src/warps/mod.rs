@@ -1,0 +1,137 @@
+//! Warps: maps of sensor points to field points.
+//!
+//! Naive registration, BARF and L2G are one thing: a per-point map with a code a frame, one global transform a frame, and
+//! the distance between the two. A warp says only how it maps; the global transform, its fit, the alignment loss and the
+//! gauge follow from that in [`Registration`], once for all warps.
+
+mod fit;
+mod global;
+mod known;
+mod local;
+
+pub use fit::fit_global;
+pub use global::GlobalWarp;
+pub use known::{KnownWarp, TRUTH as KNOWN_TRUTH};
+pub use local::LocalWarp;
+
+use crate::config::{Dof, Method, Settings, Solver};
+use raygrad_compiler::functions::loss::mean_squared_error;
+use raygrad_compiler::functions::matrix::apply_homography;
+use raygrad_compiler::functions::mlp::{Init, Parameter};
+use raygrad_compiler::{Axis, Shape, Tensor};
+use std::fmt::Debug;
+use std::sync::Arc;
+
+/// Sensor points of every frame.
+#[derive(Clone, Debug)]
+pub struct Points {
+    pub frame: Axis,
+    pub point: Axis,
+    /// Two channels along `point`, and along `frame` if the frames have different points.
+    pub xy: Tensor,
+}
+
+impl Points {
+    #[track_caller]
+    pub fn x(&self) -> Tensor {
+        self.xy.ch(0)
+    }
+    #[track_caller]
+    pub fn y(&self) -> Tensor {
+        self.xy.ch(1)
+    }
+}
+
+/// A map of sensor points to field points.
+pub trait Warp: Debug + Send + Sync {
+    /// Field points of all `at`: two channels along frame and point. `code` has [`Warp::code_width`] channels a frame.
+    fn map(&self, at: &Points, code: &Tensor) -> Tensor;
+
+    /// Channels of the trained code of a frame; 0 for none.
+    fn code_width(&self) -> usize {
+        0
+    }
+
+    /// How codes start.
+    fn code_init(&self) -> Init {
+        Init::Normal(1.0)
+    }
+
+    /// What the warp trains besides the codes.
+    fn parameters(&self) -> Vec<Parameter> {
+        vec![]
+    }
+
+    /// The `(3, 3)` transform of each frame, where the map is nothing but that. By default it is fitted to the map.
+    fn global(&self, _frame: &Axis, _code: &Tensor) -> Option<Tensor> {
+        None
+    }
+
+    /// The group that the global transform belongs to.
+    fn dof(&self) -> Dof {
+        Dof::Homography
+    }
+
+    /// How a homography is fitted.
+    fn solver(&self) -> Solver {
+        Solver::InverseIteration
+    }
+
+    /// Whether a code of zeros makes the map the identity. The gauge is then held by resetting the first frame's code
+    /// after every step, as BARF does, and otherwise by leaving the first frame's points where they are, as L2G does.
+    fn zero_code_is_identity(&self) -> bool {
+        false
+    }
+}
+
+/// The warp that settings ask for.
+pub fn of_settings(settings: &Settings) -> Arc<dyn Warp> {
+    let warp = &settings.warp;
+    match warp.method {
+        Method::None => Arc::new(KnownWarp),
+        Method::Global => Arc::new(GlobalWarp { dof: warp.dof }),
+        Method::Local => Arc::new(LocalWarp::new(warp)),
+    }
+}
+
+/// A warp applied to points, and everything that follows from it.
+#[derive(Clone, Debug)]
+pub struct Registration {
+    /// Field points of the map.
+    pub local: Tensor,
+    /// One `(3, 3)` transform a frame.
+    pub transform: Tensor,
+    /// Field points under the global transform.
+    pub global: Tensor,
+    /// Mean of (local - global)^2 over frames, points and coordinates; none where the map is the global transform.
+    pub residual: Option<Tensor>,
+}
+
+impl Registration {
+    /// Applies `warp`; `pinned` says whether the first frame is the gauge.
+    #[track_caller]
+    pub fn new(warp: &dyn Warp, at: &Points, code: &Tensor, pinned: bool) -> Registration {
+        let first = Tensor::index(&at.frame).equal(&Tensor::integers(&[0]));
+        let held = pinned && !warp.zero_code_is_identity();
+        let mapped = warp.map(at, code);
+        let local = if held { first.select(&at.xy, &mapped) } else { mapped };
+        match warp.global(&at.frame, code) {
+            Some(transform) => Registration { global: local.clone(), local, transform, residual: None },
+            None => {
+                let transform = fit_global(warp.dof(), warp.solver(), at, &local, held.then_some(&first));
+                let global = apply_homography(&transform, &at.xy);
+                let residual = Some(mean_squared_error(&local, &global));
+                Registration { local, transform, global, residual }
+            }
+        }
+    }
+}
+
+/// The trained codes of a warp, if it has any.
+pub fn codes(warp: &dyn Warp, frame: &Axis) -> Option<Parameter> {
+    let width = warp.code_width();
+    (width > 0).then(|| Parameter {
+        tensor: Tensor::parameter("warp.code", Shape::new(&[frame], width)),
+        init: warp.code_init(),
+    })
+}

@@ -1,0 +1,297 @@
+//! The CPU backend: tile programs on a thread pool.
+//!
+//! A launch is cut into chunks of tiles, a number fixed by the program. Each chunk has accumulators of its own, and chunks
+//! are summed pairwise in a fixed order, so results are the same bits for any number of threads.
+
+use crate::RunError;
+use crate::session::Executor;
+use raygrad_compiler::Program;
+use raygrad_compiler::fuse::TargetKind;
+use raygrad_compiler::ops::Reduction;
+use raygrad_compiler::plan::BufferKind;
+use raygrad_compiler::plan::region::BufferId;
+use raygrad_kernels::cpu::tile::{Chunk, Flat, Memory, TileProgram, lower, pack, run_tiles, split_flat};
+use raygrad_kernels::cpu::{AlignedVec, Isa, unblock};
+use rayon::prelude::*;
+use std::cell::RefCell;
+use std::collections::HashMap;
+use std::sync::Arc;
+
+/// Lanes of a flat launch that one task works through.
+const FLAT_TASK: usize = 16 * 1024;
+/// Lanes of a reduction over chunks that one task sums.
+const SUM_TASK: usize = 16 * 1024;
+
+thread_local! {
+    /// Scratch of this thread, grown to the largest launch it has worked on.
+    static SCRATCH: RefCell<AlignedVec> = RefCell::new(AlignedVec::zeroed(0));
+}
+
+/// A launch in two parts that do not depend on each other.
+struct Launch {
+    flats: Vec<Flat>,
+    tiles: Option<TileProgram>,
+}
+
+struct Loaded {
+    launches: Vec<Launch>,
+    /// Memory of every buffer, by [`BufferId`]: an index into `CpuExecutor::memory`.
+    places: Vec<usize>,
+    lanes: Vec<usize>,
+    packed: AlignedVec,
+    accumulators: AlignedVec,
+}
+
+/// Programs on the CPU.
+pub(crate) struct CpuExecutor {
+    pool: Arc<rayon::ThreadPool>,
+    isa: Isa,
+    memory: Vec<AlignedVec>,
+    inputs: HashMap<String, (usize, usize)>,
+    programs: Vec<Loaded>,
+}
+
+impl CpuExecutor {
+    pub fn new(pool: Arc<rayon::ThreadPool>) -> CpuExecutor {
+        CpuExecutor { pool, isa: Isa::detect(), memory: vec![], inputs: HashMap::new(), programs: vec![] }
+    }
+
+    fn allocate(&mut self, lanes: usize) -> usize {
+        self.memory.push(AlignedVec::zeroed(lanes));
+        self.memory.len() - 1
+    }
+
+    fn input(&self, name: &str) -> Result<(usize, usize), RunError> {
+        self.inputs.get(name).copied().ok_or_else(|| RunError::UnknownInput(name.into()))
+    }
+}
+
+fn lower_launch(program: &Program, index: usize) -> Launch {
+    let (flats, rest) = split_flat(program, &program.launches[index].region);
+    Launch { flats, tiles: rest.map(|region| lower(program, &region)) }
+}
+
+impl Executor for CpuExecutor {
+    fn add(&mut self, program: Arc<Program>) -> Result<usize, RunError> {
+        if program.target.kind != TargetKind::Cpu {
+            return Err(RunError::Target(program.target.kind));
+        }
+        let slots: Vec<usize> = program.slots.iter().map(|lanes| self.allocate(*lanes)).collect();
+        let mut places = vec![];
+        for buffer in &program.buffers {
+            let lanes = buffer.shape.lanes();
+            places.push(match &buffer.kind {
+                BufferKind::Temporary { slot } => slots[*slot],
+                BufferKind::Output => self.allocate(lanes),
+                BufferKind::Input { name, .. } => match self.inputs.get(name) {
+                    Some((place, _)) => *place,
+                    None => {
+                        let place = self.allocate(lanes);
+                        self.inputs.insert(name.clone(), (place, lanes));
+                        place
+                    }
+                },
+            });
+        }
+        let launches: Vec<Launch> = (0..program.launches.len()).map(|i| lower_launch(&program, i)).collect();
+        let tiles = || launches.iter().filter_map(|l| l.tiles.as_ref());
+        let packed = tiles().map(|t| t.packed).max().unwrap_or(0);
+        let accumulators = tiles().map(|t| t.accumulated * t.chunks).max().unwrap_or(0);
+        let lanes = program.buffers.iter().map(|b| b.shape.lanes()).collect();
+        self.programs.push(Loaded {
+            launches,
+            places,
+            lanes,
+            packed: AlignedVec::zeroed(packed),
+            accumulators: AlignedVec::zeroed(accumulators),
+        });
+        Ok(self.programs.len() - 1)
+    }
+
+    fn set(&mut self, input: &str, lanes: &[u32]) -> Result<(), RunError> {
+        let (place, len) = self.input(input)?;
+        self.memory[place][..len].copy_from_slice(bytemuck::cast_slice(lanes));
+        Ok(())
+    }
+
+    fn get(&mut self, input: &str) -> Result<Vec<u32>, RunError> {
+        let (place, len) = self.input(input)?;
+        Ok(bytemuck::cast_slice(&self.memory[place][..len]).to_vec())
+    }
+
+    fn run(&mut self, program: usize) -> Result<(), RunError> {
+        let loaded = &mut self.programs[program];
+        let buffers: Vec<*mut f32> = loaded.places.iter().map(|p| self.memory[*p].as_mut_ptr()).collect();
+        let memory = Memory { buffers: &buffers };
+        let isa = self.isa;
+        let (packed, accumulators) = (&mut loaded.packed, &mut loaded.accumulators);
+        let (launches, lanes) = (&loaded.launches, &loaded.lanes);
+        self.pool.install(|| {
+            for launch in launches {
+                for flat in &launch.flats {
+                    run_flat(flat, memory, isa);
+                }
+                if let Some(tiles) = &launch.tiles {
+                    run_launch(tiles, memory, isa, packed, accumulators, lanes);
+                }
+            }
+        });
+        Ok(())
+    }
+
+    fn output(&mut self, program: usize, buffer: BufferId) -> Result<Vec<u32>, RunError> {
+        let loaded = &self.programs[program];
+        let (place, lanes) = (loaded.places[buffer.0 as usize], loaded.lanes[buffer.0 as usize]);
+        Ok(bytemuck::cast_slice(&self.memory[place][..lanes]).to_vec())
+    }
+}
+
+fn with_scratch<T>(lanes: usize, f: impl FnOnce(&mut [f32]) -> T) -> T {
+    SCRATCH.with_borrow_mut(|scratch| {
+        scratch.grow(lanes);
+        f(&mut scratch[..lanes])
+    })
+}
+
+fn run_flat(flat: &Flat, memory: Memory, isa: Isa) {
+    let tasks = flat.width.div_ceil(FLAT_TASK);
+    let task = |t: usize| {
+        let range = t * FLAT_TASK..((t + 1) * FLAT_TASK).min(flat.width);
+        // SAFETY: tasks write disjoint lanes; the addresses are those of this program's buffers.
+        with_scratch(flat.scratch(), |scratch| unsafe { flat.run(range, memory, isa, scratch) });
+    };
+    if tasks == 1 { task(0) } else { (0..tasks).into_par_iter().for_each(task) }
+}
+
+fn run_launch(
+    tiles: &TileProgram,
+    memory: Memory,
+    isa: Isa,
+    packed: &mut AlignedVec,
+    accumulators: &mut AlignedVec,
+    lanes: &[usize],
+) {
+    // Packs are independent stretches of one array.
+    let mut rest = &mut packed[..tiles.packed];
+    let mut packs = vec![];
+    for p in &tiles.packs {
+        let (own, others) = rest.split_at_mut(p.len * p.elements);
+        packs.push((p, own));
+        rest = others;
+    }
+    let pack_one = |(p, own): (&raygrad_kernels::cpu::tile::Pack, &mut [f32])| {
+        let mut p = p.clone();
+        p.at = 0;
+        // SAFETY: weights are not written during a launch that reads them as weights.
+        unsafe { pack(&p, memory, own) };
+    };
+    if tiles.packed > FLAT_TASK {
+        packs.into_par_iter().for_each(pack_one)
+    } else {
+        packs.into_iter().for_each(pack_one)
+    }
+    if tiles.direct {
+        for a in &tiles.accumulators {
+            let start = if a.kind == Reduction::Sum { 0.0 } else { f32::NEG_INFINITY };
+            let at = a.buffer.0 as usize;
+            // SAFETY: the whole of a buffer that this launch alone writes.
+            unsafe { std::slice::from_raw_parts_mut(memory.buffers[at], lanes[at]).fill(start) };
+        }
+    }
+    let packed = &packed[..tiles.packed];
+    let run = |c: usize, own: &mut [f32]| {
+        for a in &tiles.accumulators {
+            own[a.at..a.at + a.len].fill(if a.kind == Reduction::Sum { 0.0 } else { f32::NEG_INFINITY });
+        }
+        with_scratch(tiles.scratch, |scratch| {
+            let mut chunk = Chunk { memory, isa, packed, scratch, accumulators: own };
+            // SAFETY: chunks write disjoint lanes of the buffers and their own accumulators.
+            unsafe { run_tiles(tiles, c, &mut chunk) };
+        });
+    };
+    if tiles.accumulated == 0 {
+        let alone = |c: usize| run(c, &mut []);
+        if tiles.chunks == 1 {
+            alone(0)
+        } else {
+            (0..tiles.chunks).into_par_iter().for_each(alone)
+        }
+        return;
+    }
+    let all = &mut accumulators[..tiles.accumulated * tiles.chunks];
+    let own = all.chunks_mut(tiles.accumulated).enumerate();
+    if tiles.chunks == 1 {
+        own.for_each(|(c, own)| run(c, own));
+    } else {
+        own.collect::<Vec<_>>().into_par_iter().for_each(|(c, own)| run(c, own));
+    }
+    if !tiles.direct {
+        combine(tiles, all, memory, lanes);
+    }
+}
+
+/// Combines the chunks' accumulators pairwise, in an order that depends on their number alone, and stores the result.
+fn combine(tiles: &TileProgram, all: &mut [f32], memory: Memory, lanes: &[usize]) {
+    let stride = tiles.accumulated;
+    let columns = Columns { base: all.as_mut_ptr(), stride };
+    let mut tasks = vec![];
+    for a in &tiles.accumulators {
+        tasks.extend((0..a.len).step_by(SUM_TASK).map(|start| (a, start..(start + SUM_TASK).min(a.len))));
+    }
+    let tree = |(a, range): (&raygrad_kernels::cpu::tile::Accumulator, std::ops::Range<usize>)| {
+        let mut step = 1;
+        while step < tiles.chunks {
+            for c in (0..tiles.chunks - step).step_by(2 * step) {
+                // SAFETY: tasks own disjoint lane ranges of all chunks; the two chunks differ.
+                let (to, from) = unsafe { (columns.lanes(c, a.at, &range), columns.lanes(c + step, a.at, &range)) };
+                match a.kind {
+                    Reduction::Sum => to.iter_mut().zip(from).for_each(|(t, f)| *t += *f),
+                    Reduction::Max => to.iter_mut().zip(from).for_each(|(t, f)| *t = if *f > *t { *f } else { *t }),
+                }
+            }
+            step *= 2;
+        }
+    };
+    if tasks.len() == 1 {
+        tasks.into_iter().for_each(tree)
+    } else {
+        tasks.into_par_iter().for_each(tree)
+    }
+    for a in &tiles.accumulators {
+        let at = a.buffer.0 as usize;
+        // SAFETY: the whole of a buffer that this launch alone writes.
+        let out = unsafe { std::slice::from_raw_parts_mut(memory.buffers[at], lanes[at]) };
+        let sum = &all[a.at..a.at + a.len];
+        match a.blocked {
+            None => out.copy_from_slice(sum),
+            Some((k, n, 1)) => unblock(sum, k, n, out, false),
+            Some((k, n, elements)) => {
+                let mut matrix = vec![0.0; k * n];
+                for e in 0..elements {
+                    unblock(&sum[e * a.len / elements..], k, n, &mut matrix, false);
+                    matrix.iter().enumerate().for_each(|(c, x)| out[c * elements + e] = *x);
+                }
+            }
+        }
+    }
+}
+
+/// The chunks' accumulators as columns that tasks share by lane ranges.
+struct Columns {
+    base: *mut f32,
+    stride: usize,
+}
+
+// SAFETY: tasks touch disjoint lanes, see `combine`.
+unsafe impl Sync for Columns {}
+
+impl Columns {
+    /// # Safety
+    /// No other reference to these lanes is alive, and they lie inside the chunk.
+    #[allow(clippy::mut_from_ref, reason = "disjointness is the caller's promise")]
+    unsafe fn lanes(&self, chunk: usize, at: usize, range: &std::ops::Range<usize>) -> &mut [f32] {
+        let start = chunk * self.stride + at + range.start;
+        // SAFETY: as the caller promises.
+        unsafe { std::slice::from_raw_parts_mut(self.base.add(start), range.len()) }
+    }
+}

@@ -1,0 +1,35 @@
+//! What can go wrong with devices and runs.
+
+use raygrad_compiler::graph::Shape;
+
+/// A device that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum DeviceError {
+    #[error("no GPU adapter {0}; `raygrad devices` lists what there is")]
+    NoAdapter(String),
+    #[error("this build has no wgpu backend (feature `wgpu`)")]
+    NotBuilt,
+    #[error("cannot start {threads} threads: {reason}")]
+    Threads { threads: usize, reason: String },
+    #[error("the adapter `{name}` refused: {reason}")]
+    Adapter { name: String, reason: String },
+}
+
+/// A program that cannot be loaded or run.
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    #[error("no program of this session has an input `{0}`")]
+    UnknownInput(String),
+    #[error("the program has no output `{0}`")]
+    UnknownOutput(String),
+    #[error("input `{name}` is {shape}: {expected} values expected, {found} given")]
+    Length { name: String, shape: Shape, expected: usize, found: usize },
+    #[error("input `{name}` is {shape}, the values given are {found}")]
+    Type { name: String, shape: Shape, found: &'static str },
+    #[error("input `{name}` is {first} in one program of the session and {second} in another")]
+    Conflict { name: String, first: Shape, second: Shape },
+    #[error("the program was compiled for {0:?}, which this device does not run")]
+    Target(raygrad_compiler::fuse::TargetKind),
+    #[error("{device}: {problem}")]
+    Device { device: String, problem: String },
+}

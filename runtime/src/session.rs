@@ -1,0 +1,159 @@
+//! Sessions: programs that share inputs by name, on one device.
+
+use crate::cpu::CpuExecutor;
+use crate::{Device, RunError};
+use raygrad_compiler::Program;
+use raygrad_compiler::graph::Shape;
+use raygrad_compiler::ops::input::Role;
+use raygrad_compiler::plan::region::BufferId;
+use raygrad_compiler::scalar::DType;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// What a backend does. Lanes are in buffer order: channel by channel, each over all elements.
+pub(crate) trait Executor: Send {
+    /// Loads a program; inputs it shares by name with earlier ones share their buffers. New inputs are zero.
+    fn add(&mut self, program: Arc<Program>) -> Result<usize, RunError>;
+    fn set(&mut self, input: &str, lanes: &[u32]) -> Result<(), RunError>;
+    fn get(&mut self, input: &str) -> Result<Vec<u32>, RunError>;
+    /// Runs a program once; need not wait for it.
+    fn run(&mut self, program: usize) -> Result<(), RunError>;
+    /// An output of a program's last run.
+    fn output(&mut self, program: usize, buffer: BufferId) -> Result<Vec<u32>, RunError>;
+}
+
+/// A program loaded into a session.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct ProgramId(usize);
+
+/// An input of a session.
+#[derive(Clone, Debug)]
+pub struct InputInfo {
+    pub role: Role,
+    pub shape: Shape,
+}
+
+/// Programs on a device and the inputs they share.
+pub struct Session {
+    executor: Box<dyn Executor>,
+    programs: Vec<Arc<Program>>,
+    inputs: BTreeMap<String, InputInfo>,
+}
+
+impl Session {
+    /// An empty session on `device`.
+    pub fn new(device: Device) -> Result<Session, RunError> {
+        let executor: Box<dyn Executor> = match device {
+            Device::Cpu { pool } => Box::new(CpuExecutor::new(pool)),
+        };
+        Ok(Session { executor, programs: vec![], inputs: BTreeMap::new() })
+    }
+
+    /// Loads a program. All inputs it does not share with earlier programs start as zeros.
+    pub fn add(&mut self, program: Program) -> Result<ProgramId, RunError> {
+        for (name, role, shape) in program.inputs() {
+            match self.inputs.get(name) {
+                Some(known) if !same_layout(&known.shape, shape) => {
+                    let (first, second) = (known.shape.clone(), shape.clone());
+                    return Err(RunError::Conflict { name: name.into(), first, second });
+                }
+                _ => self.inputs.insert(name.into(), InputInfo { role, shape: shape.clone() }),
+            };
+        }
+        let program = Arc::new(program);
+        let id = self.executor.add(program.clone())?;
+        self.programs.push(program);
+        Ok(ProgramId(id))
+    }
+
+    /// Inputs by name.
+    pub fn inputs(&self) -> impl Iterator<Item = (&str, &InputInfo)> {
+        self.inputs.iter().map(|(name, info)| (name.as_str(), info))
+    }
+
+    /// Sets a float input. Values are in the order of the axes, each element with its channels side by side.
+    pub fn set(&mut self, name: &str, values: &[f32]) -> Result<(), RunError> {
+        self.set_lanes(name, bytemuck::cast_slice(values), DType::F32)
+    }
+
+    /// Sets an integer input, ordered as in [`Session::set`].
+    pub fn set_u32(&mut self, name: &str, values: &[u32]) -> Result<(), RunError> {
+        self.set_lanes(name, values, DType::U32)
+    }
+
+    fn set_lanes(&mut self, name: &str, values: &[u32], dtype: DType) -> Result<(), RunError> {
+        let info = self.inputs.get(name).ok_or_else(|| RunError::UnknownInput(name.into()))?;
+        let shape = &info.shape;
+        if shape.dtype != dtype {
+            let found = if dtype == DType::F32 { "f32" } else { "u32" };
+            return Err(RunError::Type { name: name.into(), shape: shape.clone(), found });
+        }
+        if values.len() != shape.lanes() {
+            let (expected, found) = (shape.lanes(), values.len());
+            return Err(RunError::Length { name: name.into(), shape: shape.clone(), expected, found });
+        }
+        self.executor.set(name, &to_channel_major(values, shape))
+    }
+
+    /// The current value of a float input, in host order; waits for the device.
+    pub fn get(&mut self, name: &str) -> Result<Vec<f32>, RunError> {
+        Ok(bytemuck::allocation::cast_vec(self.get_lanes(name)?))
+    }
+
+    /// The current lanes of any input, in host order; waits for the device.
+    pub fn get_lanes(&mut self, name: &str) -> Result<Vec<u32>, RunError> {
+        let info = self.inputs.get(name).ok_or_else(|| RunError::UnknownInput(name.into()))?;
+        let lanes = self.executor.get(name)?;
+        Ok(to_host(&lanes, &info.shape))
+    }
+
+    /// Runs a program once. On a GPU this only submits.
+    pub fn run(&mut self, program: ProgramId) -> Result<(), RunError> {
+        self.executor.run(program.0)
+    }
+
+    /// A float output of the program's last run, in host order; waits for the device.
+    pub fn read(&mut self, program: ProgramId, output: &str) -> Result<Vec<f32>, RunError> {
+        Ok(bytemuck::allocation::cast_vec(self.read_lanes(program, output)?))
+    }
+
+    /// The lanes of any output, in host order; waits for the device.
+    pub fn read_lanes(&mut self, program: ProgramId, output: &str) -> Result<Vec<u32>, RunError> {
+        let plan = &self.programs[program.0];
+        let found = plan.outputs.iter().find(|(name, _)| name == output);
+        let (_, buffer) = found.ok_or_else(|| RunError::UnknownOutput(output.into()))?;
+        let shape = plan.buffer(*buffer).shape.clone();
+        let lanes = self.executor.output(program.0, *buffer)?;
+        Ok(to_host(&lanes, &shape))
+    }
+
+    /// A loaded program.
+    pub fn program(&self, id: ProgramId) -> &Program {
+        &self.programs[id.0]
+    }
+}
+
+/// Programs may be recorded with axes of their own: names and sizes must agree.
+fn same_layout(a: &Shape, b: &Shape) -> bool {
+    let axes = |s: &Shape| s.axes.iter().map(|x| (x.name().to_string(), x.size())).collect::<Vec<_>>();
+    axes(a) == axes(b) && a.channels == b.channels && a.dtype == b.dtype
+}
+
+fn to_channel_major(values: &[u32], shape: &Shape) -> Vec<u32> {
+    transpose(values, shape.axes.elements(), shape.channels.count())
+}
+
+fn to_host(lanes: &[u32], shape: &Shape) -> Vec<u32> {
+    transpose(lanes, shape.channels.count(), shape.axes.elements())
+}
+
+fn transpose(values: &[u32], rows: usize, columns: usize) -> Vec<u32> {
+    if rows == 1 || columns == 1 {
+        return values.to_vec();
+    }
+    let mut out = Vec::with_capacity(values.len());
+    for c in 0..columns {
+        out.extend((0..rows).map(|r| values[r * columns + c]));
+    }
+    out
+}

@@ -1,0 +1,75 @@
+//! Running a step on a device and comparing it with the f64 reference.
+
+use crate::worst;
+use raygrad_compiler::reference::{Array, Bindings, Data, evaluate};
+use raygrad_compiler::scalar::DType;
+use raygrad_compiler::{Step, compile};
+use raygrad_runtime::{Device, ProgramId, Session};
+
+/// A session with one program, its inputs bound.
+pub fn load(device: &Device, step: &Step, bindings: &Bindings) -> (Session, ProgramId) {
+    let program = compile(step, &device.target()).unwrap_or_else(|e| panic!("{e}"));
+    let mut session = Session::new(device.clone()).unwrap_or_else(|e| panic!("{e}"));
+    let id = session.add(program).unwrap_or_else(|e| panic!("{e}"));
+    let names: Vec<String> = session.inputs().map(|(n, _)| n.to_string()).collect();
+    for name in names {
+        match bindings.get(&name).map(|a| &a.data) {
+            Some(Data::F(v)) => session.set(&name, &v.iter().map(|x| *x as f32).collect::<Vec<_>>()),
+            Some(Data::U(v)) => session.set_u32(&name, v),
+            None => Ok(()),
+        }
+        .unwrap_or_else(|e| panic!("{e}"));
+    }
+    (session, id)
+}
+
+/// Values of all outputs after one run, in host order.
+pub fn run(device: &Device, step: &Step, bindings: &Bindings) -> Vec<Vec<f64>> {
+    let (mut session, id) = load(device, step, bindings);
+    session.run(id).unwrap_or_else(|e| panic!("{e}"));
+    let read = |(name, t): &(String, raygrad_compiler::Tensor)| {
+        let lanes = session.read_lanes(id, name).unwrap_or_else(|e| panic!("{e}"));
+        let value = |bits: u32| if t.dtype() == DType::F32 { f32::from_bits(bits) as f64 } else { bits as f64 };
+        lanes.into_iter().map(value).collect()
+    };
+    step.outputs.iter().map(read).collect()
+}
+
+/// Values of all outputs in the reference.
+pub fn reference(step: &Step, bindings: &Bindings) -> Vec<Vec<f64>> {
+    let roots: Vec<_> = step.outputs.iter().map(|(_, t)| t.clone()).collect();
+    let flat = |a: Array| match a.data {
+        Data::F(v) => v,
+        Data::U(v) => v.into_iter().map(f64::from).collect(),
+    };
+    evaluate(&roots, bindings).unwrap_or_else(|e| panic!("{e}")).into_iter().map(flat).collect()
+}
+
+/// Rounds every float to f32, so that a device and the reference start from the same numbers.
+pub fn round(bindings: &Bindings) -> Bindings {
+    let rounded = |a: &Array| match &a.data {
+        Data::F(v) => Array::floats(&a.shape, v.iter().map(|x| *x as f32 as f64).collect()),
+        Data::U(_) => a.clone(),
+    };
+    bindings.iter().map(|(k, a)| (k.clone(), rounded(a))).collect()
+}
+
+/// Compares every output on `device` with the reference; the error names the worst one.
+pub fn compare(device: &Device, step: &Step, bindings: &Bindings, tolerance: f64) -> Result<(), String> {
+    let bindings = round(bindings);
+    let (found, expected) = (run(device, step, &bindings), reference(step, &bindings));
+    for (((name, t), found), expected) in step.outputs.iter().zip(&found).zip(&expected) {
+        let error = worst(found, expected, 1e-3);
+        if error > tolerance {
+            let program = compile(step, &device.target()).map_err(|e| e.to_string())?;
+            let head = |v: &[f64]| format!("{:?}", &v[..v.len().min(8)]);
+            return Err(format!(
+                "`{name}` ({}) is off by {error:.2e} of its largest value\n found    {}\n expected {}\n{program}",
+                t.shape(),
+                head(found),
+                head(expected)
+            ));
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,149 @@
+//! Messages of ops that do not fit: both operands with axes and channels, the user's line, and a hint.
+
+use raygrad_compiler::autodiff::grad;
+use raygrad_compiler::functions::matrix::matmul;
+use raygrad_compiler::graph::{Axis, Shape, Tensor};
+use raygrad_compiler::reference::{Array, Bindings, EvalError, evaluate};
+use raygrad_compiler::scalar::DType;
+
+fn message(t: &Tensor) -> String {
+    t.error().expect("does not fit").to_string()
+}
+
+/// `file:line`, `back` lines above the call.
+macro_rules! at {
+    ($back:expr) => {
+        format!("{}:{}", file!(), line!() - $back)
+    };
+}
+
+#[test]
+fn channels_of_an_elementwise_op() {
+    let (ray, sample) = (Axis::new("ray", 4), Axis::new("sample", 8));
+    let a = Tensor::parameter("a", Shape::new(&[&ray], 3));
+    let b = Tensor::parameter("b", Shape::new(&[&ray, &sample], 2));
+    let (from_a, from_b) = (at!(2), at!(1));
+    let sum = &a + &b;
+    let here = at!(1);
+    assert_eq!(
+        message(&sum),
+        format!(
+            "add: channels 3 and 2 do not match at {here}\n  operand 1: [ray=4] x 3, from {from_a}\n  \
+             operand 2: [ray=4, sample=8] x 2, from {from_b}\n  hint: both operands need 3 channels, or one of them 1"
+        )
+    );
+    assert!(file!().starts_with("tests/"), "paths are relative to the repository: {}", file!());
+}
+
+#[test]
+fn rows_of_a_linear_layer() {
+    let ray = Axis::new("ray", 4);
+    let x = Tensor::data("x", Shape::new(&[&ray], 34));
+    let w = Tensor::parameter("w", Shape::new(&[], (32, 256)));
+    let (from_x, from_w) = (at!(2), at!(1));
+    let y = x.linear(&w);
+    let here = at!(1);
+    assert_eq!(
+        message(&y),
+        format!(
+            "linear: 34 input channels do not fit weights (32, 256) at {here}\n  operand 1: [ray=4] x 34, from {from_x}\n  \
+             operand 2: [] x (32, 256), from {from_w}\n  hint: weights (34, out) or 32 input channels would fit"
+        )
+    );
+}
+
+#[test]
+fn lane_types() {
+    let x = Tensor::data("x", Shape::new(&[], 1).with_dtype(DType::U32));
+    let from_x = at!(1);
+    let y = x.exp();
+    let here = at!(1);
+    assert_eq!(
+        message(&y),
+        format!(
+            "exp: operand 1 must be f32, found [] x 1 u32 at {here}\n  operand 1: [] x 1 u32, from {from_x}\n  \
+             hint: convert it with .to_f32()"
+        )
+    );
+    let z = Tensor::scalar(1.0).select(&x, &x);
+    assert!(message(&z).contains("hint: convert it with .to_u32()"), "{}", message(&z));
+}
+
+#[test]
+fn axes_made_twice() {
+    let (first, second) = (Axis::new("frame", 5), Axis::new("frame", 6));
+    let a = Tensor::parameter("a", Shape::new(&[&first], 1));
+    let b = Tensor::parameter("b", Shape::new(&[&second], 1));
+    let (from_a, from_b) = (at!(2), at!(1));
+    let product = a * b;
+    let here = at!(1);
+    assert_eq!(
+        message(&product),
+        format!(
+            "mul: axis `frame` has size 5 in one operand and 6 in another at {here}\n  operand 1: [frame=5] x 1, from {from_a}\n  \
+             operand 2: [frame=6] x 1, from {from_b}\n  \
+             hint: make the axis once with Axis::new and clone it, or give the second another name"
+        )
+    );
+}
+
+#[test]
+fn an_axis_that_is_not_there() {
+    let (ray, sample) = (Axis::new("ray", 4), Axis::new("sample", 8));
+    let x = Tensor::data("x", Shape::new(&[&ray], 1));
+    for (t, op) in [(x.sum(&[&sample]), "sum"), (x.cumsum(&sample), "cumsum"), (x.shift(&sample, 1), "shift")] {
+        let text = message(&t);
+        assert!(text.starts_with(&format!("{op}: [ray=4] x 1 has no ax")), "{text}");
+        assert!(text.contains("sample") && text.contains("hint: axes here: [ray=4]"), "{text}");
+    }
+}
+
+#[test]
+fn derived_functions_name_the_users_line() {
+    let a = Tensor::parameter("a", Shape::new(&[], (2, 3)));
+    let from_a = at!(1);
+    let product = matmul(&a, &a);
+    let here = at!(1);
+    assert_eq!(
+        message(&product),
+        format!(
+            "matmul: 3 columns do not meet 2 rows at {here}\n  operand 1: [] x (2, 3), from {from_a}\n  \
+             operand 2: [] x (2, 3), from {from_a}\n  hint: the inner sizes must agree; transpose() one of them?"
+        )
+    );
+}
+
+#[test]
+fn other_arguments() {
+    let x = Tensor::data("x", Shape::new(&[], 4));
+    assert!(message(&x.softplus(0.0)).contains("beta is 0"));
+    assert!(message(&x.gaussian(f64::NAN)).contains("sigma is NaN"));
+    assert!(message(&x.ch(4)).contains("channels 0 to 3 exist"));
+    assert!(message(&x.reshape((2, 3))).contains("4 channels cannot be seen as (2, 3)"));
+    assert!(message(&x.sym_eig().0).contains("reshape the channels to (n, n)"));
+    assert!(message(&x.linear(&x)).contains("weights are (in, out): (4, out) fits here"));
+    assert!(message(&Tensor::constant(&[])).contains("0 values for 0 channels"));
+    assert!(message(&Tensor::parameter("w", Shape::new(&[], 0))).contains("input `w` is empty"));
+}
+
+#[test]
+fn an_error_travels_to_whatever_is_computed_from_it() {
+    let x = Tensor::parameter("x", Shape::new(&[], 4));
+    let bad = x.ch(7);
+    let later = (&bad * 2.0).sin().sum_channels();
+    assert_eq!(message(&later), message(&bad));
+    assert_eq!(message(&grad(&later, &[&x])[0]), message(&bad));
+    match evaluate(&[later], &Bindings::new()) {
+        Err(EvalError::Record(e)) => assert_eq!(e.to_string(), message(&bad)),
+        other => panic!("evaluated to {other:?}"),
+    }
+}
+
+#[test]
+fn values_of_inputs() {
+    let x = Tensor::parameter("x", Shape::new(&[], 4));
+    let text = |b: &Bindings| evaluate(std::slice::from_ref(&x), b).expect_err("refused").to_string();
+    assert_eq!(text(&Bindings::new()), "input `x` ([] x 4) has no value");
+    let wrong = Bindings::from([("x".to_string(), Array::floats(&Shape::new(&[], 3), vec![0.0; 3]))]);
+    assert_eq!(text(&wrong), "input `x` is [] x 4, but the value given is [] x 3");
+}
