@@ -5,6 +5,7 @@
 
 use super::LowerError;
 use raygrad_compiler::graph::Shape;
+use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::plan::region::BufferId;
 use raygrad_compiler::plan::{BufferKind, Program};
 use raygrad_compiler::scalar::DType;
@@ -84,7 +85,7 @@ impl<'a> Layout<'a> {
             let dtype = buffer.shape.dtype;
             layout.fits(&buffer.label, lanes)?;
             let place = match &buffer.kind {
-                BufferKind::Input { name, .. } => layout.input(name, &buffer.shape)?,
+                BufferKind::Input { name, role } => layout.input(name, *role, &buffer.shape)?,
                 BufferKind::Output => layout.allocate("work", dtype, lanes),
                 // Integers lie among integers and share no slot: their bits must not pass through float registers.
                 BufferKind::Temporary { .. } if dtype == DType::U32 => layout.allocate("work", dtype, lanes),
@@ -111,9 +112,9 @@ impl<'a> Layout<'a> {
         Err(LowerError::TooLarge { buffer: name.into(), bytes: 4 * lanes, limit: 4 * self.max_lanes })
     }
 
-    fn input(&mut self, name: &str, shape: &Shape) -> Result<Place, LowerError> {
+    fn input(&mut self, name: &str, role: Role, shape: &Shape) -> Result<Place, LowerError> {
         if let Some((place, known)) = self.inputs.places.get(name) {
-            return if known == shape {
+            return if same_layout(known, shape) {
                 Ok(*place)
             } else {
                 let (first, second) = (Box::new(known.clone()), Box::new(shape.clone()));
@@ -121,7 +122,9 @@ impl<'a> Layout<'a> {
             };
         }
         let sealed = self.inputs.sealed;
-        let (at, offset) = grow(&mut self.inputs.arenas, sealed, "inputs", shape, self.max_lanes);
+        // Per-step values lie together: the host writes them in one go.
+        let class = if role == Role::PerStep { "per_step" } else { "inputs" };
+        let (at, offset) = grow(&mut self.inputs.arenas, sealed, class, shape, self.max_lanes);
         let place = Place { arena: ArenaId::Input(at), offset, dtype: shape.dtype };
         self.inputs.places.insert(name.into(), (place, shape.clone()));
         Ok(place)
@@ -181,10 +184,16 @@ impl<'a> Layout<'a> {
         }
     }
 
-    /// Places of the program's `count` buffers.
-    pub fn places(&self, count: usize) -> Vec<Place> {
-        self.buffers[..count].iter().map(|b| b.0).collect()
+    /// Places and lanes of the program's `count` buffers.
+    pub fn places(&self, count: usize) -> Vec<(Place, usize)> {
+        self.buffers[..count].iter().map(|b| (b.0, b.1.lanes())).collect()
     }
+}
+
+/// Programs may be recorded with axes of their own: names and sizes must agree.
+fn same_layout(a: &Shape, b: &Shape) -> bool {
+    let sizes = |s: &Shape| s.axes.iter().map(|x| (x.name().to_string(), x.size())).collect::<Vec<_>>();
+    sizes(a) == sizes(b) && a.channels.count() == b.channels.count() && a.dtype == b.dtype
 }
 
 /// Puts `shape` into the first arena of its class and type, from `first` on, that has room, or a new one.

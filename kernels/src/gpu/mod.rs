@@ -65,8 +65,8 @@ pub struct GpuProgram {
     pub launches: Vec<GpuLaunch>,
     /// Arenas of this program alone; those of the inputs are in [`Inputs`].
     pub arenas: Vec<Arena>,
-    /// Places of the program's buffers, by id.
-    pub places: Vec<Place>,
+    /// Places of the program's buffers with their numbers of lanes, by id.
+    pub places: Vec<(Place, usize)>,
 }
 
 #[derive(Debug, thiserror::Error)]
