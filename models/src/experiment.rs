@@ -82,7 +82,11 @@ impl Experiment {
 
     /// The photo to register patches of.
     pub fn image(mut self, path: impl AsRef<Path>) -> Experiment {
-        self.layered.settings.data.image = path.as_ref().to_string_lossy().into_owned();
+        self.layered.set_text(
+            "data.image",
+            &path.as_ref().to_string_lossy(),
+            Origin::Option("Experiment::image".into()),
+        );
         self
     }
 
@@ -219,6 +223,6 @@ pub fn open_device(choice: DeviceChoice, threads: Option<usize>) -> Result<Devic
     match choice {
         DeviceChoice::Auto => Device::auto(threads),
         DeviceChoice::Cpu => Device::cpu(threads),
-        DeviceChoice::Wgpu(_) => Err(DeviceError::NotBuilt),
+        DeviceChoice::Wgpu(index) => Device::wgpu(index),
     }
 }

@@ -54,3 +54,8 @@ pub mod prelude {
     pub use raygrad_compiler::ops::pick::concat;
     pub use raygrad_compiler::{Axis, Shape, Tensor};
 }
+
+/// The README's example compiles.
+#[cfg(doctest)]
+#[doc = include_str!("../../README.md")]
+struct Readme;

@@ -1,7 +1,7 @@
 //! Tests of a warp in two lines.
 //!
 //! [`check_gradients`] compares first and second derivatives with central differences of the f64 reference, and what
-//! every device computes with the reference itself. [`plan`] is the text of everything the warp compiles to, for a
+//! every device computes with the reference itself. [`kernels`] is the text of everything the warp compiles to, for a
 //! snapshot test.
 
 use crate::config::Dof;
@@ -12,7 +12,7 @@ use raygrad_compiler::functions::mlp::Init;
 use raygrad_compiler::graph::topological;
 use raygrad_compiler::ops::input::Input;
 use raygrad_compiler::reference::{Array, Bindings, Direction, EvalError, central_difference, evaluate};
-use raygrad_compiler::{Axis, Shape, Step, StepError, Target, Tensor, compile};
+use raygrad_compiler::{Axis, Program, Shape, Step, StepError, Target, Tensor, compile};
 use raygrad_runtime::{Device, DeviceError, RunError, Session};
 
 /// A derivative or a device that disagrees with the reference.
@@ -28,6 +28,9 @@ pub enum TestError {
     Evaluate(#[from] EvalError),
     #[error(transparent)]
     Compile(#[from] StepError),
+    #[cfg(feature = "wgpu")]
+    #[error(transparent)]
+    Lower(#[from] raygrad_kernels::gpu::LowerError),
     #[error(transparent)]
     Open(#[from] DeviceError),
     #[error(transparent)]
@@ -175,26 +178,43 @@ pub fn check_gradients(warp: &dyn Warp) -> Result<(), TestError> {
     Ok(())
 }
 
-/// The plan of a warp with its gradients, for CPU and GPU: what a snapshot test compares.
-pub fn plan(warp: &dyn Warp) -> Result<String, TestError> {
+/// Everything a warp with its gradients compiles to, plans for CPU and GPU and the GPU's kernels as WGSL: what a snapshot
+/// test compares.
+pub fn kernels(warp: &dyn Warp) -> Result<String, TestError> {
     let mut bench = Bench::new(warp)?;
     // Data in training, so no gradient goes there.
     bench.inputs.retain(|t| t.input_name() != Some("points"));
     let step = bench.step();
     let (cpu, gpu) = (compile(&step, &Target::cpu())?, compile(&step, &Target::gpu())?);
-    Ok(format!("cpu\n{cpu}\ngpu\n{gpu}"))
+    Ok(format!("cpu\n{cpu}\ngpu\n{gpu}\n{}", wgsl(&gpu)?))
 }
 
+#[cfg(feature = "wgpu")]
+fn wgsl(program: &Program) -> Result<String, TestError> {
+    use raygrad_kernels::gpu::{Inputs, Limits, lower};
+    let lowered = lower(program, &mut Inputs::default(), &Limits::default())?;
+    let sources = lowered.launches.iter().flat_map(|l| &l.kernels);
+    sources.map(|k| Ok(format!("// {}\n{}", k.name, k.wgsl()?))).collect()
+}
+#[cfg(not(feature = "wgpu"))]
+fn wgsl(_: &Program) -> Result<String, TestError> {
+    Ok(String::new())
+}
+
+/// The CPU, and an adapter if there is one.
 fn devices() -> Result<Vec<(String, Device)>, DeviceError> {
-    Ok(vec![("cpu".to_string(), Device::cpu(Some(1))?)])
+    let mut devices = vec![("cpu".to_string(), Device::cpu(Some(1))?)];
+    devices.extend(Device::wgpu(None).ok().map(|d| ("wgpu".to_string(), d)));
+    Ok(devices)
 }
 
-/// Compares the kernels of a warp with a reviewed snapshot; the calling crate needs `insta`.
+/// Compares [`testing::kernels`](crate::testing::kernels) of a warp with a reviewed snapshot; the calling crate needs
+/// `insta`.
 #[macro_export]
 macro_rules! assert_kernels {
     ($name:expr, $warp:expr) => {
-        match $crate::testing::plan($warp) {
-            Ok(plan) => insta::assert_snapshot!($name, plan),
+        match $crate::testing::kernels($warp) {
+            Ok(kernels) => insta::assert_snapshot!($name, kernels),
             Err(error) => panic!("{error}"),
         }
     };

@@ -8,8 +8,8 @@ use raygrad_runtime::Device;
 use raygrad_tests::backend::devices;
 use raygrad_tests::check::{check, same_bits};
 use raygrad_tests::graphs::{Recipe, shrink};
-use std::cell::RefCell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Mutex;
 
 /// Seeds of the graphs to check: a part of all, so that parts run side by side.
 fn seeds(part: u64, parts: u64) -> impl Iterator<Item = u64> {
@@ -38,20 +38,22 @@ fn failure(devices: &[Device], recipe: &Recipe) -> Option<String> {
     };
     match catch_unwind(AssertUnwindSafe(all)) {
         Ok(result) => result.err(),
-        Err(_) => Some(PANIC.take()),
+        Err(_) => Some(PANIC.lock().map_or_else(|e| e.to_string(), |text| text.clone())),
     }
 }
 
-thread_local! {
-    /// Message and place of the last panic here.
-    static PANIC: RefCell<String> = const { RefCell::new(String::new()) };
-}
+/// Message and place of the last panic, which may be a device thread's.
+static PANIC: Mutex<String> = Mutex::new(String::new());
 
 fn check_graphs(part: u64, parts: u64) {
     let devices = devices();
     let mut failures: Vec<String> = vec![];
     // Panics are failures like others, printed once their graph is small.
-    std::panic::set_hook(Box::new(|info| PANIC.set(info.to_string())));
+    std::panic::set_hook(Box::new(|info| {
+        if let Ok(mut text) = PANIC.lock() {
+            *text = info.to_string();
+        }
+    }));
     for seed in seeds(part, parts) {
         let recipe = Recipe::new(seed);
         if failure(&devices, &recipe).is_some() {

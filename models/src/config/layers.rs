@@ -50,6 +50,12 @@ impl Layered {
         }
     }
 
+    /// Sets a value that is text, such as a path.
+    pub fn set_text(&mut self, key: &str, text: &str, origin: Origin) {
+        // Text fits a field of text: there is nothing to refuse.
+        let _ = self.put(key, Value::String(text.to_string()), origin);
+    }
+
     /// Where a value was set.
     pub fn origin(&self, key: &str) -> Origin {
         self.origins.get(key).cloned().unwrap_or_else(|| Origin::Option(self.name.clone()))

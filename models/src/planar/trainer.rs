@@ -260,6 +260,8 @@ impl Trainer {
 fn device_name(device: &Device) -> String {
     match device {
         Device::Cpu { pool } => format!("CPU, {} threads", pool.current_num_threads()),
+        #[cfg(feature = "wgpu")]
+        Device::Wgpu { gpu } => gpu.adapter().name.clone(),
     }
 }
 

@@ -107,7 +107,10 @@ impl Report<'_> {
         };
         let palette = [[0x1c, 0x1e, 0x21], [0x25, 0x63, 0xeb], [0xd9, 0x48, 0x0f]];
         let terms = [("total", palette[0]), ("render", palette[1]), ("alignment", palette[2])];
+        // Without a second term the sum is the first.
+        let summed = steps.iter().any(|e| e.loss.get("total") != e.loss.get("render"));
         let losses: Vec<Curve> = (terms.iter())
+            .filter(|(name, _)| summed || *name != "total")
             .map(|(name, color)| curve(name, *color, 2, &|e| e.loss.get(*name).copied()))
             .filter(|c| !c.points.is_empty())
             .collect();

@@ -22,6 +22,8 @@ pub struct PlotError {
 }
 
 const SIZE: (u32, u32) = (640, 340);
+const GRID: RGBColor = RGBColor(0xe8, 0xea, 0xee);
+const AXIS: RGBColor = RGBColor(0x9a, 0xa1, 0xab);
 const FONT: &str = "system-ui, sans-serif";
 
 /// An SVG of the curves, with a logarithmic vertical axis if asked for and possible.
@@ -33,7 +35,7 @@ pub fn plot(what: &str, curves: &[Curve], logarithmic: bool) -> Result<String, P
     let mut svg = String::new();
     let drawn = if values.is_empty() {
         Ok(())
-    } else if logarithmic && positive.is_finite() && high > positive {
+    } else if logarithmic && positive.is_finite() && high > 10.0 * positive {
         draw(&mut svg, what, curves, last, (positive * 0.8, high * 1.25), true)
     } else {
         let margin = ((high - low) * 0.05).max(1e-9);
@@ -49,31 +51,33 @@ fn draw(svg: &mut String, what: &str, curves: &[Curve], last: f64, (low, high): 
     let root = SVGBackend::with_string(svg, SIZE).into_drawing_area();
     root.fill(&WHITE)?;
     let mut builder = ChartBuilder::on(&root);
-    builder.margin(12).x_label_area_size(34).y_label_area_size(62);
-    // The two kinds of axes are different types: the same lines twice.
+    builder.margin(12).x_label_area_size(38).y_label_area_size(66);
+    // The two kinds of axes are different types, so these lines cannot be shared as a function.
+    macro_rules! lines {
+        ($chart:expr) => {{
+            let mut chart = $chart;
+            let mut mesh = chart.configure_mesh();
+            mesh.label_style((FONT, 13)).light_line_style(WHITE).bold_line_style(GRID).axis_style(AXIS);
+            mesh.x_label_formatter(&|x| format!("{x:.0}")).y_label_formatter(&|y| number(*y));
+            mesh.x_desc("step").y_desc(what).draw()?;
+            for curve in curves {
+                let style = style(curve);
+                let points = curve.points.iter().copied().map(|(x, y)| (x, y.max(low)));
+                let drawn = chart.draw_series(LineSeries::new(points, style))?;
+                // A single curve is named by its axis.
+                if curves.len() > 1 {
+                    drawn.label(&curve.label).legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], style));
+                }
+            }
+            let mut labels = chart.configure_series_labels();
+            labels.position(SeriesLabelPosition::UpperRight).label_font((FONT, 13));
+            labels.background_style(WHITE.mix(0.85)).draw()?;
+        }};
+    }
     if log {
-        let mut chart = builder.build_cartesian_2d(0.0..last, (low..high).log_scale())?;
-        chart.configure_mesh().label_style((FONT, 13)).light_line_style(WHITE).x_desc("step").y_desc(what).draw()?;
-        for curve in curves {
-            let points = curve.points.iter().copied().map(|(x, y)| (x, y.max(low)));
-            let style = style(curve);
-            let drawn = chart.draw_series(LineSeries::new(points, style))?;
-            drawn.label(&curve.label).legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], style));
-        }
-        legend(curves, || {
-            Ok(chart.configure_series_labels().label_font((FONT, 13)).background_style(WHITE.mix(0.8)).draw()?)
-        })?;
+        lines!(builder.build_cartesian_2d(0.0..last, (low..high).log_scale())?);
     } else {
-        let mut chart = builder.build_cartesian_2d(0.0..last, low..high)?;
-        chart.configure_mesh().label_style((FONT, 13)).light_line_style(WHITE).x_desc("step").y_desc(what).draw()?;
-        for curve in curves {
-            let style = style(curve);
-            let drawn = chart.draw_series(LineSeries::new(curve.points.iter().copied(), style))?;
-            drawn.label(&curve.label).legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], style));
-        }
-        legend(curves, || {
-            Ok(chart.configure_series_labels().label_font((FONT, 13)).background_style(WHITE.mix(0.8)).draw()?)
-        })?;
+        lines!(builder.build_cartesian_2d(0.0..last, low..high)?);
     }
     root.present()?;
     Ok(())
@@ -84,9 +88,13 @@ fn style(curve: &Curve) -> ShapeStyle {
     RGBColor(r, g, b).stroke_width(curve.width)
 }
 
-/// A single curve is named by its axis.
-fn legend(curves: &[Curve], draw: impl FnOnce() -> Drawn) -> Drawn {
-    if curves.len() > 1 { draw() } else { Ok(()) }
+/// A number on an axis: short, without trailing zeros.
+fn number(y: f64) -> String {
+    match y.abs() {
+        a if a != 0.0 && !(1e-3..1e5).contains(&a) => format!("{y:.0e}"),
+        a if a < 1.0 => format!("{}", (y * 1e5).round() / 1e5),
+        _ => format!("{}", (y * 100.0).round() / 100.0),
+    }
 }
 
 #[cfg(test)]

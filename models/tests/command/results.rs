@@ -147,6 +147,7 @@ fn bench_prints_the_numbers_of_a_step() {
     assert!((bench["gflop_per_step"].as_f64().unwrap() / expected - 1.0).abs() < 1e-9, "{text}");
 }
 
+#[cfg(feature = "wgpu")]
 #[test]
 fn explain_prints_the_plan_and_writes_artefacts() {
     let w = Workplace::new();
@@ -156,4 +157,10 @@ fn explain_prints_the_plan_and_writes_artefacts() {
     assert!(graph.contains("output render") && graph.contains("update warp.code"));
     w.succeed(&["explain", "tiny.toml", "--emit", "plan", "--out", "artefacts"]);
     assert_eq!(names(&w.path("artefacts")), ["plan.txt"]);
+    assert_eq!(w.run(&["explain", "tiny.toml", "--emit", "spirv"]).status.code(), Some(2));
+    for (emit, ending) in [("wgsl", ".wgsl"), ("spirv", ".spv")] {
+        w.succeed(&["explain", "tiny.toml", "--emit", emit, "--out", emit]);
+        let files = names(&w.path(emit));
+        assert!(files.len() > 3 && files.iter().all(|f| f.ends_with(ending)), "{files:?}");
+    }
 }

@@ -169,7 +169,7 @@ impl Builder {
             0 => p.shift(axis, 1),
             1 => p.reverse_cumsum(axis) * share,
             2 => p.mean(&[axis]),
-            _ => (p - p.sum_over(&Axes::new([axis.clone()])) * share) * 0.5,
+            _ => p - p.sum_over(&Axes::new([axis.clone()])) * (share * 0.5),
         };
         step.updates.push((p.clone(), value));
     }

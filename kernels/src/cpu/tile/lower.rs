@@ -100,7 +100,7 @@ impl Lowering<'_> {
         }
     }
 
-    /// Stride and size of a buffer's axis that is not in the domain.
+    /// Stride and size of one axis of a buffer.
     fn axis_stride(&self, buffer: BufferId, axis: &Axis) -> (usize, usize) {
         let axes = &self.program.buffer(buffer).shape.axes;
         (axes.iter().skip_while(|a| *a != axis).skip(1).map(Axis::size).product(), axis.size())
@@ -193,7 +193,14 @@ impl Lowering<'_> {
             }
             RegionOp::Take { table, axis } => {
                 let index = self.values.get(inst.inputs[0]).clone();
-                let view = self.view(*table);
+                let mut view = self.view(*table);
+                // The index takes the place of this axis, whether or not others vary along it.
+                for (stride, outer) in view.outer.iter_mut().zip(&self.outer) {
+                    *stride = if *outer == axis { 0 } else { *stride };
+                }
+                if region.inner.as_ref() == Some(axis) {
+                    view.inner = 0;
+                }
                 let (axis_stride, axis_size) = self.axis_stride(*table, axis);
                 let out = self.values.create(id, inst.channels, full);
                 let channels = inst.channels;

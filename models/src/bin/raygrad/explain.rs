@@ -15,8 +15,8 @@ use std::time::{Duration, Instant};
 pub struct ExplainArgs {
     #[command(flatten)]
     choice: Choice,
-    /// Print or write an artefact instead of the explanation.
-    #[arg(long, value_enum)]
+    /// Print or write an artefact instead of the explanation; SPIR-V is binary and needs a folder.
+    #[arg(long, value_enum, requires_if("spirv", "out"))]
     emit: Option<Artefact>,
     /// Folder for the artefacts, a file a kernel; without it they are printed.
     #[arg(long, value_name = "DIR")]
@@ -62,7 +62,7 @@ pub fn run(args: &ExplainArgs) -> anyhow::Result<ExitCode> {
         None => vec![("explain.txt".to_string(), program.to_string().into_bytes())],
         Some(Artefact::Graph) => vec![("graph.txt".to_string(), graph(&step).into_bytes())],
         Some(Artefact::Plan) => vec![("plan.txt".to_string(), format!("{program:#?}\n").into_bytes())],
-        Some(Artefact::Wgsl | Artefact::Spirv) => anyhow::bail!("this build has no GPU kernels"),
+        Some(artefact @ (Artefact::Wgsl | Artefact::Spirv)) => kernels(&program, artefact)?,
     };
     match &args.out {
         Some(folder) => {
@@ -85,6 +85,30 @@ pub fn run(args: &ExplainArgs) -> anyhow::Result<ExitCode> {
         timing(recorded, &program);
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// A file a kernel, numbered in the order in which they run.
+#[cfg(feature = "wgpu")]
+fn kernels(program: &Program, artefact: Artefact) -> anyhow::Result<Vec<(String, Vec<u8>)>> {
+    use raygrad_kernels::gpu::{Inputs, Limits, lower};
+    let lowered = lower(program, &mut Inputs::default(), &Limits::default())?;
+    let mut files = vec![];
+    for (i, kernel) in lowered.launches.iter().flat_map(|l| &l.kernels).enumerate() {
+        let name: String = kernel.name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect();
+        files.push(match artefact {
+            Artefact::Spirv => {
+                let bytes = kernel.spirv()?.iter().flat_map(|word| word.to_le_bytes()).collect();
+                (format!("{i:03}_{name}.spv"), bytes)
+            }
+            _ => (format!("{i:03}_{name}.wgsl"), kernel.wgsl()?.into_bytes()),
+        });
+    }
+    Ok(files)
+}
+
+#[cfg(not(feature = "wgpu"))]
+fn kernels(_: &Program, _: Artefact) -> anyhow::Result<Vec<(String, Vec<u8>)>> {
+    anyhow::bail!("this build has no GPU kernels (feature `wgpu`)")
 }
 
 /// One line an op, operands before users.
