@@ -53,13 +53,15 @@ fn constants_keep_their_places_over_several_tiles() {
 #[test]
 fn a_bias_recorded_after_its_layer() {
     let ray = Axis::new("ray", 200);
-    let mut inputs = Inputs::new("bias");
-    let x = inputs.parameter("x", Shape::new(&[&ray], 5));
-    let w = inputs.parameter("w", Shape::new(&[], (5, 8)));
-    let y = x.linear(&w);
-    let b = inputs.parameter("b", Shape::new(&[], 8));
-    let negative = -&b;
-    inputs.check(&[&(&y + &b).relu(), &(x.linear(&w) + negative)], &[]);
+    for negative in [false, true] {
+        let mut inputs = Inputs::new("bias");
+        let x = inputs.parameter("x", Shape::new(&[&ray], 5));
+        let w = inputs.parameter("w", Shape::new(&[], (5, 8)));
+        let y = x.sin().linear(&w);
+        let b = inputs.parameter("b", Shape::new(&[], 8));
+        let bias = if negative { -&b } else { b };
+        inputs.check(&[&(&y + bias).relu()], &[]);
+    }
 }
 
 #[test]
@@ -69,19 +71,13 @@ fn a_layer_and_a_layer_that_does_not_vary_along_the_rows() {
     let x = inputs.parameter("x", Shape::new(&[&frame, &ray], 5));
     let code = inputs.parameter("code", Shape::new(&[&frame], 3));
     let w = inputs.parameter("w", Shape::new(&[], (5, 4)));
-    let v = inputs.parameter("v", Shape::new(&[], (3, 4)));
-    let (y, z) = (x.linear(&w), code.linear(&v));
-    inputs.check(&[&(&y + &z), &(&z + &y).relu(), &z.greater_than(&Tensor::scalar(9.0)).select(&z, &y)], &[]);
-}
-
-#[test]
-fn a_layer_of_one_element() {
-    let frame = Axis::new("frame", 1);
-    let mut inputs = Inputs::new("one element");
-    let x = inputs.parameter("x", Shape::new(&[&frame], 33));
-    let w = inputs.parameter("w", Shape::new(&[&frame], (33, 2)));
-    let (y, z) = (x.linear(&w), x.sin().linear(&w));
-    inputs.check(&[&(&y + &z), &x.outer(&y, &Axes::none())], &[]);
+    let v = inputs.parameter("v", Shape::new(&[], (2, 4)));
+    // Recorded along the rays, but the same for all of them.
+    let wide = code.broadcast_to(x.axes()).channel_groups(vec![vec![0, 1], vec![2]]);
+    let (y, z) = (x.linear(&w), wide.linear(&v));
+    inputs.check(&[&(&y + &z)], &[]);
+    inputs.check(&[&(&z + &y).relu()], &[]);
+    inputs.check(&[&z.greater_than(&Tensor::scalar(9.0)).select(&z, &y)], &[]);
 }
 
 #[test]
