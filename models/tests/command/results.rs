@@ -1,8 +1,6 @@
 //! The command from outside: what a run leaves behind, and that it can be stopped and resumed bit by bit.
 
-mod common;
-
-use common::{Workplace, names, stderr};
+use crate::workplace::{Workplace, names, stderr};
 use serde_json::Value;
 use std::io::{BufRead, BufReader};
 use std::process::Stdio;

@@ -1,8 +1,6 @@
 //! Bad input: one clear message, exit code 2, nothing half-written.
 
-mod common;
-
-use common::{Workplace, names, stderr};
+use crate::workplace::{Workplace, names, stderr};
 
 #[track_caller]
 fn mentions(text: &str, parts: &[&str]) {
