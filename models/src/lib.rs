@@ -16,3 +16,8 @@ pub mod warps;
 pub use error::Error;
 pub use experiment::{Experiment, Observer, Outcome, Quiet, open_device};
 pub use raygrad_runtime::Device;
+
+/// The README's example compiles.
+#[cfg(doctest)]
+#[doc = include_str!("../../README.md")]
+struct Readme;

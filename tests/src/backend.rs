@@ -6,6 +6,11 @@ use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Step, compile};
 use raygrad_runtime::{Device, ProgramId, Session};
 
+/// Every device that tests run on.
+pub fn devices() -> Vec<Device> {
+    vec![Device::cpu(Some(2)).unwrap_or_else(|e| panic!("{e}"))]
+}
+
 /// A session with one program, its inputs bound.
 pub fn load(device: &Device, step: &Step, bindings: &Bindings) -> (Session, ProgramId) {
     let program = compile(step, &device.target()).unwrap_or_else(|e| panic!("{e}"));

@@ -1,6 +1,8 @@
 //! What the tests share: seeded numbers, bindings, and the graph around an op under test.
 
 pub mod backend;
+pub mod check;
+pub mod graphs;
 pub mod vectors;
 
 use raygrad_compiler::autodiff::grad;
@@ -21,6 +23,13 @@ impl Rng {
     /// Uniform in `low..high`.
     pub fn uniform(&mut self, low: f64, high: f64) -> f64 {
         low + (high - low) * (self.bits() >> 11) as f64 * 2f64.powi(-53)
+    }
+    /// Uniform in `0..n`.
+    pub fn below(&mut self, n: usize) -> usize {
+        (self.bits() >> 33) as usize % n
+    }
+    pub fn chance(&mut self, probability: f64) -> bool {
+        self.uniform(0.0, 1.0) < probability
     }
     /// Uniform values for every lane of `shape`.
     pub fn array(&mut self, shape: &Shape, low: f64, high: f64) -> Array {

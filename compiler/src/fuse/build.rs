@@ -279,6 +279,11 @@ impl Builder {
             Form::Index { axis } => RegionOp::Index(axis),
             Form::Take { axis } => {
                 let table = self.buffer(&operands[0]);
+                if !operands[0].axes().contains(&axis) {
+                    // A table repeated along the axis is the same wherever it is read.
+                    values.insert(id, push(region, &operands[0], RegionOp::Load(table), vec![]));
+                    return self.write(region, values, &t, stored);
+                }
                 values.insert(id, push(region, &t, RegionOp::Take { table, axis }, vec![values[&operands[1].id()]]));
                 return self.write(region, values, &t, stored);
             }

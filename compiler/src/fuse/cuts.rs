@@ -168,7 +168,8 @@ impl Cuts {
     pub fn stored_for(&self, user: &Info, i: usize) -> bool {
         let operand = self.get(&user.operands[i]);
         if user.needs_buffer(i) {
-            return !self.is_view(&user.operands[i]);
+            let weights = matches!(user.form, Form::Linear { .. });
+            return operand.form != Form::Input && !(weights && self.is_view(&user.operands[i]));
         }
         let gpu = self.target.kind == TargetKind::Gpu;
         let layer = matches!(user.form, Form::Linear { .. }) && user.shared_weights();

@@ -80,8 +80,12 @@ pub fn split_flat(program: &Program, region: &Region) -> (Vec<Flat>, Option<Regi
     (flats, rest)
 }
 
-/// Whether one part writes, in place, what another part reads: then the parts have no order.
+/// Whether one part writes, in place, what another part reads, or what it reads itself at other lanes or in a later
+/// store: then there is no right order.
 fn interfere(flats: &[Flat], rest: Option<&Region>) -> bool {
+    if flats.iter().any(Flat::overtakes) {
+        return true;
+    }
     let mut parts: Vec<(Vec<BufferId>, Vec<BufferId>)> = flats.iter().map(|f| (f.reads(), f.writes())).collect();
     parts.extend(rest.map(|r| (r.reads(), r.stores.iter().map(Store::buffer).collect())));
     let clash = |i: usize, j: usize| i != j && parts[i].1.iter().any(|w| parts[j].0.contains(w));
@@ -150,6 +154,19 @@ impl Flat {
 
     fn writes(&self) -> Vec<BufferId> {
         self.stores.iter().map(|s| s.1).collect()
+    }
+
+    /// Whether a block of lanes is written before it is read.
+    fn overtakes(&self) -> bool {
+        let moved = self.pieces().any(|a| match a {
+            FlatArg::Pieces(pieces) => pieces.iter().any(|p| self.writes().contains(&p.1)),
+            _ => false,
+        });
+        let copied = |(at, (arg, _)): (usize, &(FlatArg, BufferId))| match arg {
+            FlatArg::Buffer(from) => self.stores[..at].iter().any(|(_, to)| to == from),
+            _ => false,
+        };
+        moved || self.stores.iter().enumerate().any(copied)
     }
 
     fn pieces(&self) -> impl Iterator<Item = &FlatArg> {

@@ -19,12 +19,14 @@ pub fn lower(program: &Program, region: &Region) -> TileProgram {
     let mut lowering =
         Lowering { program, region, outer, values: Values::new(region, ld), out: empty(inner, rows, ld) };
     lowering.out.outer = lowering.outer.iter().map(|a| a.size()).collect();
-    // A buffer that is updated in place is read before anything is written.
-    let updated = |id: &InstId| match &region.inst(*id).op {
-        RegionOp::Load(b) => region.stores.iter().any(|s| s.buffer() == *b),
+    // A buffer that is updated in place is read before anything is written. Constants are written once for all tiles:
+    // their places must never have been another value's. Uniform values are small, and layers want their bias first.
+    let early = |id: &InstId| match &region.inst(*id).op {
+        RegionOp::Load(b) => region.is_uniform(*id) || region.stores.iter().any(|s| s.buffer() == *b),
+        RegionOp::Const(_) => true,
         _ => false,
     };
-    let (first, rest): (Vec<InstId>, Vec<InstId>) = region.ids().partition(updated);
+    let (first, rest): (Vec<InstId>, Vec<InstId>) = region.ids().partition(early);
     for id in first {
         lowering.inst(id);
     }
@@ -35,7 +37,7 @@ pub fn lower(program: &Program, region: &Region) -> TileProgram {
             lowering.store(store);
         }
     }
-    for store in region.stores.iter().filter(|s| s.values().iter().max().is_some_and(updated)) {
+    for store in region.stores.iter().filter(|s| s.values().iter().max().is_some_and(early)) {
         lowering.store(store);
     }
     lowering.finish()
@@ -98,7 +100,7 @@ impl Lowering<'_> {
         }
     }
 
-    /// Stride and size of a buffer's axis that is not in the domain.
+    /// Stride and size of one axis of a buffer.
     fn axis_stride(&self, buffer: BufferId, axis: &Axis) -> (usize, usize) {
         let axes = &self.program.buffer(buffer).shape.axes;
         (axes.iter().skip_while(|a| *a != axis).skip(1).map(Axis::size).product(), axis.size())
@@ -189,7 +191,14 @@ impl Lowering<'_> {
             }
             RegionOp::Take { table, axis } => {
                 let index = self.values.get(inst.inputs[0]).clone();
-                let view = self.view(*table);
+                let mut view = self.view(*table);
+                // The index takes the place of this axis, whether or not others vary along it.
+                for (stride, outer) in view.outer.iter_mut().zip(&self.outer) {
+                    *stride = if *outer == axis { 0 } else { *stride };
+                }
+                if region.inner.as_ref() == Some(axis) {
+                    view.inner = 0;
+                }
                 let (axis_stride, axis_size) = self.axis_stride(*table, axis);
                 let out = self.values.create(id, inst.channels, full);
                 let channels = inst.channels;
@@ -249,12 +258,15 @@ impl Lowering<'_> {
         self.out.ops.push(TileOp::Map { program: lane_program(program), runs, full });
     }
 
-    /// A layer whose only reader is a pointwise program that the matrix kernel can apply itself.
+    /// A layer without a value yet whose only reader is a pointwise program that the matrix kernel can apply itself. The
+    /// program's other operands are known.
     fn layer_of(&self, id: InstId) -> Option<FusedLayer> {
         let inst = self.region.inst(id);
         let RegionOp::Map(program) = &inst.op else { return None };
-        let layer = *inst.inputs.iter().find(|i| matches!(self.region.inst(**i).op, RegionOp::Linear(_)))?;
-        let alone = self.values.users(layer) == 1
+        let mut unknown = inst.inputs.iter().filter(|i| !self.values.known(**i));
+        let (Some(&layer), None) = (unknown.next(), unknown.next()) else { return None };
+        let alone = matches!(self.region.inst(layer).op, RegionOp::Linear(_))
+            && self.values.users(layer) == 1
             && self.region.inst(layer).axes == inst.axes
             && self.region.inst(layer).channels == inst.channels
             && !self.region.is_uniform(id);
@@ -301,10 +313,8 @@ impl Lowering<'_> {
         if !matches!(self.region.inst(id).op, RegionOp::Linear(_)) || self.values.users(id) != 1 {
             return false;
         }
-        // The reader's other operands must be known by now for the decision to be the same there.
-        let Some(user) = self.region.ids().find(|u| self.region.inst(*u).inputs.contains(&id)) else { return false };
-        let ready = self.region.inst(user).inputs.iter().all(|i| *i <= id);
-        ready && self.layer_of(user).is_some_and(|fused| fused.layer == id)
+        let user = self.region.ids().find(|u| self.region.inst(*u).inputs.contains(&id));
+        user.and_then(|user| self.layer_of(user)).is_some()
     }
 
     /// Computes a layer with its epilogue as the value of `id`.
@@ -455,8 +465,9 @@ impl Lowering<'_> {
         };
         let positions = self.out.outer.iter().product::<usize>();
         self.out.direct = positions >= 2 * MAX_CHUNKS && self.out.ops.iter().all(per_outer);
-        let units = if self.out.direct { positions } else { self.out.tiles() };
-        self.out.chunks = units.clamp(1, MAX_CHUNKS);
+        let units = if self.out.direct { positions } else { self.out.tiles() }.max(1);
+        // A chunk's accumulators are worth a few tiles of work each.
+        self.out.chunks = (units / CHUNK_TILES).next_power_of_two().clamp(units.min(2), MAX_CHUNKS);
         self.out
     }
 }

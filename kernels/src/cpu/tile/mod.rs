@@ -25,6 +25,8 @@ const LAYER_ROWS: usize = 192;
 const PLAIN_ROWS: usize = 1024;
 /// Chunks a launch is cut into at most. Fixed, so that sums do not depend on the number of threads.
 const MAX_CHUNKS: usize = 16;
+/// Tiles that a chunk should have at least, if that leaves two chunks.
+const CHUNK_TILES: usize = 4;
 /// Channels from which an operand in pieces is multiplied piece by piece instead of being put together first.
 const WIDE: usize = 64;
 /// Lanes that a pointwise program works on at a time: its temporaries stay in L1.

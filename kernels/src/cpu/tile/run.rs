@@ -482,7 +482,7 @@ impl Tile<'_> {
             }
         };
         let ld = self.program.ld;
-        let side_by_side = value.places.windows(2).all(|w| w[1] - w[0] == ld as Place);
+        let side_by_side = value.places.windows(2).all(|w| w[1] == w[0] + ld as Place);
         if view.inner == 0 && view.elements == 1 && value.full && side_by_side && kind == Reduction::Sum {
             let x = self.at(value.places[0]);
             // SAFETY: all channels at once: `rows` lanes each, `ld` apart, and as many accumulator lanes.

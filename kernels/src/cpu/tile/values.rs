@@ -42,6 +42,11 @@ impl Values {
         }
     }
 
+    /// Whether `id` has a value yet: a layer that its reader computes never gets one.
+    pub fn known(&self, id: InstId) -> bool {
+        self.values[id.0 as usize].is_some()
+    }
+
     /// Number of instructions and stores that read `id`.
     pub fn users(&self, id: InstId) -> usize {
         self.users[id.0 as usize]

@@ -68,7 +68,7 @@ pub fn run(args: &ExplainArgs) -> anyhow::Result<ExitCode> {
         Some(folder) => {
             output_folder(folder)?;
             for (name, bytes) in &files {
-                write_atomically(&folder.join(name), bytes)?;
+                write_atomically(&folder.join(name), bytes).map_err(raygrad::Error::from)?;
             }
             println!("{} files in {}", files.len(), folder.display());
         }

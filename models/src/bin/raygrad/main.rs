@@ -9,7 +9,8 @@ mod progress;
 mod train;
 
 use clap::{Args, Parser, Subcommand};
-use raygrad::config::{ConfigError, PRESETS};
+use raygrad::config::PRESETS;
+use raygrad::run::files::WriteError;
 use raygrad::{Error, Experiment};
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -91,20 +92,15 @@ fn main() -> ExitCode {
     match done {
         Ok(code) => code,
         Err(error) => {
-            eprintln!("error: {error:#}");
-            ExitCode::from(exit_code(&error))
+            let bad_input = error.downcast_ref::<Error>().map(Error::is_bad_input);
+            match bad_input {
+                // These name their causes themselves.
+                Some(_) => eprintln!("error: {error}"),
+                None => eprintln!("error: {error:#}"),
+            }
+            ExitCode::from(if bad_input == Some(true) { 2 } else { 1 })
         }
     }
-}
-
-/// 2 where what was given is at fault, 1 where the computation is.
-fn exit_code(error: &anyhow::Error) -> u8 {
-    let bad_input = error.chain().any(|cause| {
-        cause.downcast_ref::<Error>().is_some_and(Error::is_bad_input)
-            || cause.is::<ConfigError>()
-            || cause.is::<raygrad::run::files::WriteError>()
-    });
-    if bad_input { 2 } else { 1 }
 }
 
 fn devices() -> anyhow::Result<ExitCode> {
@@ -123,6 +119,6 @@ fn presets() -> anyhow::Result<ExitCode> {
 }
 
 /// A folder given for output, made if it is not there.
-fn output_folder(path: &PathBuf) -> Result<(), raygrad::run::files::WriteError> {
-    std::fs::create_dir_all(path).map_err(|source| raygrad::run::files::WriteError { path: path.clone(), source })
+fn output_folder(path: &PathBuf) -> Result<(), Error> {
+    std::fs::create_dir_all(path).map_err(|source| WriteError { path: path.clone(), source }.into())
 }

@@ -36,7 +36,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         [("--steps", "optim.steps", &args.steps), ("--perturbation", "data.perturbation", &args.perturbation)];
     for (option, key, value) in options {
         if let Some(value) = value {
-            experiment.set_option(option, key, value)?;
+            experiment.set_option(option, key, value).map_err(raygrad::Error::from)?;
         }
     }
     if let Some(out) = &args.out {

@@ -1,0 +1,165 @@
+//! What must hold of any step: the same values simplified and recorded, on every device and in the f64 reference, for any
+//! number of threads, and in the step after.
+
+use crate::backend::{load, round};
+use crate::worst;
+use raygrad_compiler::graph::{Tensor, topological};
+use raygrad_compiler::reference::{Array, Bindings, Data, evaluate};
+use raygrad_compiler::scalar::DType;
+use raygrad_compiler::simplify::simplify;
+use raygrad_compiler::{Step, compile};
+use raygrad_runtime::Device;
+use std::collections::HashMap;
+
+/// A named result: an output, or an input after its update.
+pub type Results = Vec<(String, Vec<f64>)>;
+
+/// How far a device may be off, relative to the largest value of a tensor.
+const TOLERANCE: f64 = 1e-4;
+/// ... or this many times what rounding every value of the graph to f32 changes, where a result is a small difference.
+const NOISE: f64 = 60.0;
+
+/// Every result of a step in the f64 reference.
+pub fn expected(step: &Step, bindings: &Bindings) -> Results {
+    let values = evaluate(&step.roots(), bindings).unwrap_or_else(|e| panic!("{e}"));
+    name(step, values)
+}
+
+/// The same with every node's value rounded to f32.
+fn rounded(step: &Step, bindings: &Bindings) -> Results {
+    let roots = step.roots();
+    let mut values: HashMap<u64, Array> = HashMap::new();
+    for t in topological(roots.iter().cloned()) {
+        let value = match t.input_name() {
+            Some(name) => bindings[name].clone(),
+            None => t.op().eval(&t.inputs().iter().map(|i| &values[&i.id()]).collect::<Vec<_>>(), t.shape()),
+        };
+        let one = Bindings::from([(String::new(), value)]);
+        values.insert(t.id(), round(&one).remove("").expect("just inserted"));
+    }
+    name(step, roots.iter().map(|r| values[&r.id()].clone()).collect())
+}
+
+fn name(step: &Step, values: Vec<Array>) -> Results {
+    let (outputs, updates) = values.split_at(step.outputs.len());
+    let outputs = step.outputs.iter().zip(outputs).map(|((name, t), v)| (name.clone(), lanes(v, t)));
+    let updates = step.updates.iter().zip(updates).map(|((input, _), v)| (after(input), lanes(v, input)));
+    outputs.chain(updates).collect()
+}
+
+fn after(input: &Tensor) -> String {
+    format!("`{}` afterwards", input.input_name().unwrap_or_default())
+}
+
+/// The lanes of `value` seen with the axes of `like`.
+fn lanes(value: &Array, like: &Tensor) -> Vec<f64> {
+    let flat = match &value.data {
+        Data::F(v) => v.clone(),
+        Data::U(v) => v.iter().map(|u| *u as f64).collect(),
+    };
+    if value.shape.axes == *like.axes() {
+        return flat;
+    }
+    let n = like.width();
+    let element = |e: usize| value.element_of(like.shape(), e);
+    (0..like.axes().elements()).flat_map(|e| flat[element(e) * n..][..n].to_vec()).collect()
+}
+
+/// A step on a device: the results of two runs, the second from where the first ended, and the inputs in between.
+pub fn found(device: &Device, step: &Step, bindings: &Bindings) -> [(Bindings, Results); 2] {
+    let (mut session, id) = load(device, step, bindings);
+    let mut now = bindings.clone();
+    let mut run = || {
+        let before = now.clone();
+        session.run(id).unwrap_or_else(|e| panic!("{e}"));
+        let mut results = vec![];
+        for (name, t) in &step.outputs {
+            let lanes = session.read_lanes(id, name).unwrap_or_else(|e| panic!("{e}"));
+            results.push((name.clone(), values(t, &lanes)));
+        }
+        for (input, _) in &step.updates {
+            let name = input.input_name().unwrap_or_default();
+            let lanes = session.get_lanes(name).unwrap_or_else(|e| panic!("{e}"));
+            results.push((after(input), values(input, &lanes)));
+            let array = match input.dtype() {
+                DType::F32 => Array::floats(input.shape(), values(input, &lanes)),
+                DType::U32 => Array::integers(input.shape(), lanes),
+            };
+            now.insert(name.into(), array);
+        }
+        (before, results)
+    };
+    [run(), run()]
+}
+
+fn values(t: &Tensor, lanes: &[u32]) -> Vec<f64> {
+    let value = |bits: &u32| if t.dtype() == DType::F32 { f32::from_bits(*bits) as f64 } else { *bits as f64 };
+    lanes.iter().map(value).collect()
+}
+
+/// All properties of one step.
+pub fn check(devices: &[Device], step: &Step, bindings: &Bindings) -> Result<(), String> {
+    let bindings = round(bindings);
+    let reference = expected(step, &bindings);
+    agree("the simplified graph", &reference, &expected(&simplify(step), &bindings), 1e-9, || Some(vec![]))?;
+    for device in devices {
+        let what = format!("{:?}", device.target().kind);
+        for (at, (before, results)) in found(device, step, &bindings).iter().enumerate() {
+            let later = if at > 0 { expected(step, before) } else { vec![] };
+            let reference = if at > 0 { &later } else { &reference };
+            let noise = || Some(rounded(step, before));
+            agree(&format!("{what}, run {}", at + 1), reference, results, TOLERANCE, noise).map_err(|e| {
+                let program = compile(step, &device.target()).map_or_else(|e| e.to_string(), |p| p.to_string());
+                format!("{e}\n{program}")
+            })?;
+        }
+    }
+    Ok(())
+}
+
+/// The same bits for two numbers of threads.
+pub fn same_bits(a: &Device, b: &Device, step: &Step, bindings: &Bindings) -> Result<(), String> {
+    let bindings = round(bindings);
+    for ((_, a), (_, b)) in found(a, step, &bindings).iter().zip(&found(b, step, &bindings)) {
+        for ((name, a), (_, b)) in a.iter().zip(b) {
+            let bits = |v: &[f64]| v.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
+            if bits(a) != bits(b) {
+                return Err(format!("{name} differs with the number of threads"));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Compares results by name; `noise` is what rounding makes of them, asked for only where they differ.
+fn agree(
+    what: &str,
+    expected: &Results,
+    found: &Results,
+    tolerance: f64,
+    noise: impl Fn() -> Option<Results>,
+) -> Result<(), String> {
+    for (at, ((name, expected), (_, found))) in expected.iter().zip(found).enumerate() {
+        let error = worst(found, expected, 1e-30);
+        if error <= tolerance {
+            continue;
+        }
+        let rounding = noise().and_then(|n| n.get(at).map(|(_, v)| worst(v, expected, 1e-30))).unwrap_or(0.0);
+        if error <= NOISE * rounding {
+            continue;
+        }
+        let far = |i: &usize| {
+            let scale = expected.iter().fold(1e-30f64, |m, x| m.max(x.abs()));
+            ((found[*i] - expected[*i]).abs() / scale).partial_cmp(&tolerance) != Some(std::cmp::Ordering::Less)
+        };
+        let lanes: Vec<usize> = (0..expected.len()).filter(far).collect();
+        let first: Vec<_> = lanes.iter().take(6).map(|i| (*i, found[*i], expected[*i])).collect();
+        return Err(format!(
+            "{what}: {name} is off by {error:.2e} (rounding: {rounding:.2e}) in {} of {} lanes; lane, found, expected: \
+             {first:?}",
+            lanes.len(),
+            expected.len()
+        ));
+    }
+    Ok(())
+}

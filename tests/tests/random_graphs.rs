@@ -1,0 +1,82 @@
+//! Random graphs on every device against the f64 reference.
+//!
+//! `RAYGRAD_NIGHTLY=1` runs 10 000 of them, `RAYGRAD_GRAPHS=first..end` those of some seeds. A failure prints the smallest
+//! recipe found that still fails.
+
+use raygrad_compiler::StepError;
+use raygrad_runtime::Device;
+use raygrad_tests::backend::devices;
+use raygrad_tests::check::{check, same_bits};
+use raygrad_tests::graphs::{Recipe, shrink};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Mutex;
+
+/// Seeds of the graphs to check: a part of all, so that parts run side by side.
+fn seeds(part: u64, parts: u64) -> impl Iterator<Item = u64> {
+    let range = match std::env::var("RAYGRAD_GRAPHS") {
+        Ok(text) => {
+            let (first, end) = text.split_once("..").expect("RAYGRAD_GRAPHS is first..end");
+            first.parse().expect("a number")..end.parse().expect("a number")
+        }
+        Err(_) if std::env::var_os("RAYGRAD_NIGHTLY").is_some() => 0..10_000,
+        Err(_) => 0..600,
+    };
+    range.filter(move |s| s % parts == part)
+}
+
+/// What is wrong with a recipe's graph, panics included.
+fn failure(devices: &[Device], recipe: &Recipe) -> Option<String> {
+    let all = || {
+        let graph = recipe.build();
+        match graph.step.check() {
+            Err(StepError::Empty) => return Ok(()),
+            checked => checked.map_err(|e| e.to_string())?,
+        }
+        check(devices, &graph.step, &graph.bindings)?;
+        let threads = [1, 2].map(|n| Device::cpu(Some(n)).expect("starts threads"));
+        same_bits(&threads[0], &threads[1], &graph.step, &graph.bindings)
+    };
+    match catch_unwind(AssertUnwindSafe(all)) {
+        Ok(result) => result.err(),
+        Err(_) => Some(PANIC.lock().map_or_else(|e| e.to_string(), |text| text.clone())),
+    }
+}
+
+/// Message and place of the last panic, which may be a device thread's.
+static PANIC: Mutex<String> = Mutex::new(String::new());
+
+fn check_graphs(part: u64, parts: u64) {
+    let devices = devices();
+    let mut failures: Vec<String> = vec![];
+    // Panics are failures like others, printed once their graph is small.
+    std::panic::set_hook(Box::new(|info| {
+        if let Ok(mut text) = PANIC.lock() {
+            *text = info.to_string();
+        }
+    }));
+    for seed in seeds(part, parts) {
+        let recipe = Recipe::new(seed);
+        if failure(&devices, &recipe).is_some() {
+            let small = shrink(&recipe, |r| failure(&devices, r).is_some());
+            let text = failure(&devices, &small).unwrap_or_default();
+            let nodes = raygrad_compiler::graph::topological(small.build().step.roots());
+            let nodes: Vec<String> = nodes.iter().map(|t| format!("{t:?}")).collect();
+            failures.push(format!("{small:?}\n{}\n{text}", nodes.join("\n")));
+            if failures.len() == 5 {
+                break;
+            }
+        }
+    }
+    let _ = std::panic::take_hook();
+    assert!(failures.is_empty(), "{} graphs fail\n{}", failures.len(), failures.join("\n\n"));
+}
+
+#[test]
+fn first_half() {
+    check_graphs(0, 2);
+}
+
+#[test]
+fn second_half() {
+    check_graphs(1, 2);
+}
