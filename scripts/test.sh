@@ -11,7 +11,7 @@ cd "$(dirname "$0")/.."
 nightly=no
 for arg in "$@"; do
     case $arg in
-    --nightly) nightly=yes ;;
+    --nightly) nightly=yes; export RAYGRAD_NIGHTLY=1 ;;
     *) echo "usage: scripts/test.sh [--nightly]" >&2; exit 2 ;;
     esac
 done

@@ -46,6 +46,11 @@ pub use error::Error;
 pub use experiment::{Experiment, Observer, Outcome, Quiet, open_device};
 pub use raygrad_runtime::Device;
 
+/// The README's example compiles.
+#[cfg(doctest)]
+#[doc = include_str!("../../README.md")]
+struct Readme;
+
 /// What defining and training a warp takes.
 pub mod prelude {
     pub use crate::warps::{Points, Warp};
@@ -54,8 +59,3 @@ pub mod prelude {
     pub use raygrad_compiler::ops::pick::concat;
     pub use raygrad_compiler::{Axis, Shape, Tensor};
 }
-
-/// The README's example compiles.
-#[cfg(doctest)]
-#[doc = include_str!("../../README.md")]
-struct Readme;

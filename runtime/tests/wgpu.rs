@@ -45,9 +45,11 @@ fn every_op() {
     let mut failures = vec![];
     for sample in registry().into_iter().filter(|s| only.as_ref().is_none_or(|o| s.name.contains(o.as_str()))) {
         let graph = MidGraph::new(&sample);
+        let start = std::time::Instant::now();
         if let Err(e) = compare(&device, &step(&graph, sample.differentiable), &graph.bindings, 2e-5) {
             failures.push(format!("{}: {e}", sample.name));
         }
+        println!("{:5} ms  {}", start.elapsed().as_millis(), sample.name);
     }
     assert!(failures.is_empty(), "{} ops fail\n{}", failures.len(), failures.join("\n\n"));
 }

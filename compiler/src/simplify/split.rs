@@ -113,7 +113,9 @@ fn weights(t: &Tensor) -> Option<Tensor> {
     }
     let parts = groups_by_axes(x)?;
     let out = d.width();
-    let blocks: Vec<Tensor> = parts.iter().map(|(part, _)| part.outer(d, keep)).collect();
+    // A part may lack axes that are kept: its block is the same along them.
+    let kept = |part: &Tensor| Axes::new(keep.iter().filter(|a| part.axes().union(d.axes()).contains(a)).cloned());
+    let blocks: Vec<Tensor> = parts.iter().map(|(part, _)| part.outer(d, &kept(part))).collect();
     let mut pick = vec![(0, 0); x.width() * out];
     for (block, (_, positions)) in parts.iter().enumerate() {
         for (i, row) in positions.iter().enumerate() {
@@ -126,5 +128,5 @@ fn weights(t: &Tensor) -> Option<Tensor> {
         return None;
     }
     let op = Pick { pick: pick.into(), channels: t.channels(), name: "concat" };
-    Some(Tensor::record_arc(std::sync::Arc::new(op), blocks))
+    Some(Tensor::record_arc(std::sync::Arc::new(op), blocks).broadcast_to(t.axes()))
 }

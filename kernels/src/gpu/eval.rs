@@ -3,7 +3,7 @@
 //! A channel is a number known now or a value of the kernel: the first unrolls, the second indexes.
 
 use super::builder::{Memory, Value};
-use super::channels::{affine, is_indexable, runs_of, sequence};
+use super::channels::{Linear, Run, affine, is_indexable, runs_of, sequence};
 use super::memory::{Emit, Position, kind};
 use super::{eigen, scalar};
 use naga::BinaryOperator as Op;
@@ -318,49 +318,63 @@ impl<'r> Values<'r> {
         sum.unwrap_or_else(|| e.b.f(0.0))
     }
 
-    /// Channel `c` of a choice or of short sums of channels: a branch a run.
+    /// Channel `c` of a choice or of sums of channels: a branch a range of c.
     fn choose(&mut self, e: &mut Emit, id: InstId, c: Value) -> Value {
-        let region = self.region;
-        let inst = region.inst(id);
-        let runs = runs_of(&inst.op).unwrap_or_default();
-        let run_value = |values: &mut Self, e: &mut Emit, run: &super::channels::Run| {
-            let mut sum: Option<Value> = None;
-            for term in &run.terms {
-                let operand = inst.inputs[term.operand];
-                let first = e.b.u(run.first);
-                let offset = e.b.sub(c, first);
-                let size = e.b.u(term.slope.unsigned_abs() as u32);
-                let (moved, base) = (e.b.mul(offset, size), e.b.u(term.base));
-                let from = if term.slope < 0 { e.b.sub(base, moved) } else { e.b.add(moved, base) };
-                let channel = if run.end - run.first == 1 { Channel::At(term.base) } else { Channel::Var(from) };
-                let value = values.channel(e, operand, channel);
-                sum = Some(sum.map_or(value, |s| e.b.add(s, value)));
-            }
-            sum.unwrap_or_else(|| e.b.literal(kind(inst.dtype), 0))
-        };
-        if let [only] = &runs[..] {
-            return run_value(self, e, only);
+        let inst = self.region.inst(id);
+        let runs = runs_of(&inst.op);
+        let Some((last, before)) = runs.split_last() else { return e.b.literal(kind(inst.dtype), 0) };
+        if before.is_empty() {
+            return self.run(e, id, last, c);
         }
         let zero = e.b.literal(kind(inst.dtype), 0);
         let zero = if self.at.len() == 4 { e.b.splat(zero) } else { zero };
         let chosen = e.b.var("chosen", zero);
-        let (last, before) = runs.split_last().map_or((None, &runs[..0]), |(l, b)| (Some(l), b));
+        let mut branch = |e: &mut Emit, run: &Run| {
+            let value = self.run(e, id, run, c);
+            let value = if chosen.is_vector() { e.b.splat(value) } else { value };
+            e.b.set(chosen, value);
+        };
         for run in before {
             let end = e.b.u(run.end);
             let here = e.b.less(c, end);
             e.b.open_if(here);
-            let value = run_value(self, e, run);
-            let value = if self.at.len() == 4 { e.b.splat(value) } else { value };
-            e.b.set(chosen, value);
+            branch(e, run);
             e.b.open_else();
         }
-        if let Some(run) = last {
-            let value = run_value(self, e, run);
-            let value = if self.at.len() == 4 { e.b.splat(value) } else { value };
-            e.b.set(chosen, value);
-        }
+        branch(e, last);
         before.iter().for_each(|_| e.b.close_if());
         e.b.get(chosen)
+    }
+
+    /// Channel `c` of a range of output channels.
+    fn run(&mut self, e: &mut Emit, id: InstId, run: &Run, c: Value) -> Value {
+        let inst = self.region.inst(id);
+        let mut sum: Option<Value> = None;
+        for term in &run.terms {
+            let operand = inst.inputs[term.operand];
+            let (count, step) = (term.count, term.step);
+            let value = if run.end - run.first == 1 && count == 1 {
+                self.channel(e, operand, Channel::At(term.from.base))
+            } else {
+                let first = e.b.u(run.first);
+                let own = e.b.sub(c, first);
+                let from = linear(e, &term.from, own);
+                if count == 1 {
+                    self.channel(e, operand, Channel::Var(from))
+                } else {
+                    let zero = self.zero(e);
+                    self.fold(e, count, zero, |values, e, sum, i| {
+                        let step = e.b.u(step);
+                        let offset = e.b.mul(i, step);
+                        let at = e.b.add(from, offset);
+                        let term = values.channel(e, operand, Channel::Var(at));
+                        e.b.add(sum, term)
+                    })
+                }
+            };
+            sum = Some(sum.map_or(value, |s| e.b.add(s, value)));
+        }
+        sum.unwrap_or_else(|| e.b.literal(kind(inst.dtype), 0))
     }
 
     /// The operand `by` places earlier along the inner axis, 0 outside.
@@ -402,6 +416,24 @@ impl<'r> Values<'r> {
         let at = channel.value(e);
         e.b.load(result, at)
     }
+}
+
+/// A formula's value for a number.
+fn linear(e: &mut Emit, formula: &Linear, number: Value) -> Value {
+    let mut at = e.b.u(formula.base);
+    let mut rest = number;
+    for (i, (radix, stride)) in formula.digits.iter().enumerate() {
+        let radix = e.b.u(*radix);
+        let last = i + 1 == formula.digits.len();
+        let digit = if last { rest } else { e.b.rem(rest, radix) };
+        let size = e.b.u(stride.unsigned_abs() as u32);
+        let moved = e.b.mul(digit, size);
+        at = if *stride < 0 { e.b.sub(at, moved) } else { e.b.add(at, moved) };
+        if !last {
+            rest = e.b.div(rest, radix);
+        }
+    }
+    at
 }
 
 /// Constant lanes.

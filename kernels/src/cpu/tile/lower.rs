@@ -145,9 +145,7 @@ impl Lowering<'_> {
                 self.keep(id);
             }
             RegionOp::Map(program) => {
-                if let Some(fused) = self.layer_of(id)
-                    && !self.values.known(fused.layer)
-                {
+                if let Some(fused) = self.layer_of(id) {
                     return self.layer_as(id, &fused);
                 }
                 self.map(id, inst, program, full);
@@ -260,12 +258,15 @@ impl Lowering<'_> {
         self.out.ops.push(TileOp::Map { program: lane_program(program), runs, full });
     }
 
-    /// A layer whose only reader is a pointwise program that the matrix kernel can apply itself.
+    /// A layer without a value yet whose only reader is a pointwise program that the matrix kernel can apply itself. The
+    /// program's other operands are known.
     fn layer_of(&self, id: InstId) -> Option<FusedLayer> {
         let inst = self.region.inst(id);
         let RegionOp::Map(program) = &inst.op else { return None };
-        let layer = *inst.inputs.iter().find(|i| matches!(self.region.inst(**i).op, RegionOp::Linear(_)))?;
-        let alone = self.values.users(layer) == 1
+        let mut unknown = inst.inputs.iter().filter(|i| !self.values.known(**i));
+        let (Some(&layer), None) = (unknown.next(), unknown.next()) else { return None };
+        let alone = matches!(self.region.inst(layer).op, RegionOp::Linear(_))
+            && self.values.users(layer) == 1
             && self.region.inst(layer).axes == inst.axes
             && self.region.inst(layer).channels == inst.channels
             && !self.region.is_uniform(id);
@@ -312,10 +313,8 @@ impl Lowering<'_> {
         if !matches!(self.region.inst(id).op, RegionOp::Linear(_)) || self.values.users(id) != 1 {
             return false;
         }
-        // The reader's other operands must be known by now for the decision to be the same there.
-        let Some(user) = self.region.ids().find(|u| self.region.inst(*u).inputs.contains(&id)) else { return false };
-        let ready = self.region.inst(user).inputs.iter().all(|i| *i <= id);
-        ready && self.layer_of(user).is_some_and(|fused| fused.layer == id)
+        let user = self.region.ids().find(|u| self.region.inst(*u).inputs.contains(&id));
+        user.and_then(|user| self.layer_of(user)).is_some()
     }
 
     /// Computes a layer with its epilogue as the value of `id`.
