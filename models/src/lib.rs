@@ -1,8 +1,61 @@
-//! raygrad: differentiable rendering.
+//! raygrad: differentiable rendering. Models as tensor graphs, differentiated, fused and run on CPU or GPU.
+//!
+//! An [`Experiment`] trains; [`warps::Warp`] is what a registration method implements; everything else serves those two.
+//!
+//! A warp of one's own is a map of points; pose extraction, alignment loss, pictures, checkpoints and tests follow:
+//!
+//! ```
+//! use raygrad::prelude::*;
+//!
+//! #[derive(Debug)]
+//! struct Shear(Mlp);
+//!
+//! impl Warp for Shear {
+//!     fn map(&self, at: &Points, code: &Tensor) -> Tensor {
+//!         let k = self.0.apply(&concat([&at.xy, code]));
+//!         &at.xy + concat([&(k.ch(0) * at.y()), &(k.ch(1) * at.x())])
+//!     }
+//!     fn code_width(&self) -> usize {
+//!         16
+//!     }
+//!     fn parameters(&self) -> Vec<Parameter> {
+//!         self.0.parameters.clone()
+//!     }
+//! }
+//!
+//! let shear = Shear(Mlp::new(MlpSpec::new("shear", &[2 + 16, 32, 2])));
+//! raygrad::testing::check_gradients(&shear)?;
+//! let experiment = Experiment::preset("planar-l2g-small")?.warp(shear);
+//! # drop(experiment);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 pub mod config;
 pub mod data;
+mod error;
+mod experiment;
 pub mod fields;
 pub mod geometry;
+pub mod pictures;
 pub mod planar;
+pub mod report;
 pub mod run;
+pub mod testing;
 pub mod warps;
+
+pub use error::Error;
+pub use experiment::{Experiment, Observer, Outcome, Quiet, open_device};
+pub use raygrad_runtime::Device;
+
+/// The README's example compiles.
+#[cfg(doctest)]
+#[doc = include_str!("../../README.md")]
+struct Readme;
+
+/// What defining and training a warp takes.
+pub mod prelude {
+    pub use crate::warps::{Points, Warp};
+    pub use crate::{Device, Experiment};
+    pub use raygrad_compiler::functions::mlp::{Init, Mlp, MlpSpec, Parameter};
+    pub use raygrad_compiler::ops::pick::concat;
+    pub use raygrad_compiler::{Axis, Shape, Tensor};
+}

@@ -10,6 +10,9 @@ use std::sync::Arc;
 pub enum Device {
     /// The CPU, with a pool of its own threads.
     Cpu { pool: Arc<rayon::ThreadPool> },
+    /// A GPU, or software that acts as one.
+    #[cfg(feature = "wgpu")]
+    Wgpu { gpu: Arc<crate::wgpu::Gpu> },
 }
 
 /// A device as listed for people.
@@ -25,7 +28,23 @@ pub struct DeviceInfo {
 impl Device {
     /// A real GPU if there is one, else the CPU.
     pub fn auto(threads: Option<usize>) -> Result<Device, DeviceError> {
+        #[cfg(feature = "wgpu")]
+        if let Some(gpu) = crate::wgpu::Gpu::auto() {
+            return Ok(Device::Wgpu { gpu: Arc::new(gpu) });
+        }
         Device::cpu(threads)
+    }
+
+    /// The adapter numbered `index` in [`Device::list`], or the best one, software included.
+    #[cfg(feature = "wgpu")]
+    pub fn wgpu(index: Option<usize>) -> Result<Device, DeviceError> {
+        Ok(Device::Wgpu { gpu: Arc::new(crate::wgpu::Gpu::open(index)?) })
+    }
+
+    /// This build has no GPU backend.
+    #[cfg(not(feature = "wgpu"))]
+    pub fn wgpu(_: Option<usize>) -> Result<Device, DeviceError> {
+        Err(DeviceError::NotBuilt)
     }
 
     /// The CPU with `threads` threads, by default one a core. Results do not depend on the number.
@@ -44,17 +63,29 @@ impl Device {
     pub fn target(&self) -> Target {
         match self {
             Device::Cpu { .. } => Target::cpu(),
+            #[cfg(feature = "wgpu")]
+            Device::Wgpu { .. } => Target::gpu(),
         }
     }
 
     /// Everything programs can run on here.
     pub fn list() -> Vec<DeviceInfo> {
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
-        vec![DeviceInfo {
+        let cpu = DeviceInfo {
             id: "cpu".into(),
             name: format!("CPU, {threads} threads"),
             backend: "cpu",
             details: format!("{} kernels", Isa::detect()),
-        }]
+        };
+        #[cfg_attr(not(feature = "wgpu"), expect(unused_mut))]
+        let mut all = vec![cpu];
+        #[cfg(feature = "wgpu")]
+        all.extend(crate::wgpu::Gpu::list().into_iter().enumerate().map(|(i, a)| DeviceInfo {
+            id: format!("wgpu:{i}"),
+            name: a.name,
+            backend: a.backend,
+            details: format!("{}, {}", a.device_type, a.driver),
+        }));
+        all
     }
 }

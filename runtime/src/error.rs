@@ -30,6 +30,8 @@ pub enum RunError {
     Conflict { name: String, first: Shape, second: Shape },
     #[error("the program was compiled for {0:?}, which this device does not run")]
     Target(raygrad_compiler::fuse::TargetKind),
+    #[error("{device}: `{buffer}` has {bytes} bytes, the device binds at most {limit} at once")]
+    TooLarge { device: String, buffer: String, bytes: u64, limit: u64 },
     #[error("{device}: {problem}")]
     Device { device: String, problem: String },
 }

@@ -8,6 +8,8 @@ pub mod cpu;
 mod device;
 mod error;
 mod session;
+#[cfg(feature = "wgpu")]
+pub mod wgpu;
 
 pub use device::{Device, DeviceInfo};
 pub use error::{DeviceError, RunError};

@@ -45,6 +45,8 @@ impl Session {
     pub fn new(device: Device) -> Result<Session, RunError> {
         let executor: Box<dyn Executor> = match device {
             Device::Cpu { pool } => Box::new(CpuExecutor::new(pool)),
+            #[cfg(feature = "wgpu")]
+            Device::Wgpu { gpu } => Box::new(crate::wgpu::WgpuExecutor::new(gpu)),
         };
         Ok(Session { executor, programs: vec![], inputs: BTreeMap::new() })
     }

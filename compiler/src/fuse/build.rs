@@ -131,6 +131,7 @@ impl Builder {
     fn store_for(&mut self, key: &Key, ids: &BTreeSet<u64>) {
         let mut candidates: Vec<Candidate> = vec![];
         let mut needed = vec![];
+        let mut room = self.cuts.target.store_bytes;
         let mut seen: HashSet<u64> = ids.clone().into_iter().collect();
         let mut stack: Vec<u64> = ids.iter().copied().collect();
         while let Some(id) = stack.pop() {
@@ -158,9 +159,14 @@ impl Builder {
                 let shapes: Vec<_> = info.operands.iter().map(|o| o.shape().clone()).collect();
                 let flops = info.tensor.op().flops(&shapes, info.tensor.shape());
                 let target = &self.cuts.target;
-                // Over few elements even a wide value takes no memory worth mentioning.
-                let storable = width <= target.store_channels || info.tensor.shape().lanes() <= target.store_lanes;
-                let expensive = flops > target.recompute_flops * width as u64 && storable;
+                let costly = flops > target.recompute_flops * width as u64;
+                // Wide values are stored as long as there is room; over few elements they take none worth mentioning.
+                let bytes = 4 * info.tensor.shape().lanes();
+                let narrow = width <= target.store_channels || bytes <= target.store_free_bytes;
+                let expensive = costly && (narrow || bytes <= room);
+                if expensive && !narrow {
+                    room -= bytes;
+                }
                 candidates.push(Candidate { id, channels: width as u64, expensive, operands });
             }
         }

@@ -23,8 +23,10 @@ pub struct Target {
     /// Expensive values of at most this many channels are not computed again by a later region: they, or fewer channels
     /// computed from them, are stored.
     pub store_channels: usize,
-    /// So are expensive values of at most this many lanes in all.
-    pub store_lanes: usize,
+    /// So are expensive values of at most this many bytes.
+    pub store_free_bytes: usize,
+    /// And wider ones, as long as those of one region take no more bytes than this together.
+    pub store_bytes: usize,
     /// Operations per channel up to which an op is not expensive.
     pub recompute_flops: u64,
     /// Operations per element up to which values computed from inputs alone are free.
@@ -41,13 +43,21 @@ pub enum TargetKind {
 
 impl Target {
     pub fn cpu() -> Target {
-        Target { kind: TargetKind::Cpu, store_channels: 32, store_lanes: 1 << 16, recompute_flops: 64, free_flops: 600 }
+        Target {
+            kind: TargetKind::Cpu,
+            store_channels: 32,
+            store_free_bytes: 1 << 18,
+            store_bytes: 192 << 20,
+            recompute_flops: 64,
+            free_flops: 600,
+        }
     }
     pub fn gpu() -> Target {
         Target {
             kind: TargetKind::Gpu,
             store_channels: usize::MAX,
-            store_lanes: usize::MAX,
+            store_free_bytes: 0,
+            store_bytes: 0,
             recompute_flops: 16,
             free_flops: 600,
         }

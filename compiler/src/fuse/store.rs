@@ -35,8 +35,10 @@ pub(super) fn choose(candidates: &[Candidate], needed: &[u64]) -> Vec<u64> {
     for n in needed {
         flow.edge(2 * index[n] + 1, sink, u64::MAX);
     }
-    let reached = flow.maximise(source, sink);
-    let cut = |i: &usize| reached[2 * i] && !reached[2 * i + 1];
+    flow.maximise(source, sink);
+    // Of all minimum cuts the one nearest to the needs: what is stored is then used as it is.
+    let ahead = flow.reaches(sink);
+    let cut = |i: &usize| !ahead[2 * i] && ahead[2 * i + 1];
     (0..candidates.len()).filter(cut).map(|i| candidates[i].id).collect()
 }
 
@@ -62,8 +64,25 @@ impl Flow {
         self.room.push(0);
     }
 
-    /// Saturates the network; returns which nodes the source still reaches.
-    fn maximise(&mut self, source: usize, sink: usize) -> Vec<bool> {
+    /// Which nodes still have room to the sink.
+    fn reaches(&self, sink: usize) -> Vec<bool> {
+        let mut ahead = vec![false; self.from.len()];
+        ahead[sink] = true;
+        let mut stack = vec![sink];
+        while let Some(b) = stack.pop() {
+            for e in &self.from[b] {
+                // The reverse of an edge out of b is an edge into it.
+                if self.room[e ^ 1] > 0 && !ahead[self.to[*e]] {
+                    ahead[self.to[*e]] = true;
+                    stack.push(self.to[*e]);
+                }
+            }
+        }
+        ahead
+    }
+
+    /// Saturates the network.
+    fn maximise(&mut self, source: usize, sink: usize) {
         loop {
             let mut by: Vec<Option<usize>> = vec![None; self.from.len()];
             let mut reached = vec![false; self.from.len()];
@@ -79,7 +98,7 @@ impl Flow {
                 }
             }
             if !reached[sink] {
-                return reached;
+                return;
             }
             let path: Vec<usize> = std::iter::successors(by[sink], |e| by[self.to[*e ^ 1]]).collect();
             let amount = path.iter().map(|e| self.room[*e]).min().unwrap_or(0);

@@ -175,13 +175,15 @@ fn replaces_in_place(launches: &[Launch], value: BufferId, old: BufferId, buffer
     let whole = region.domain == shape.axes
         && shape.axes == buffers[value.0 as usize].shape.axes
         && region.stores.iter().any(|s| matches!(s, Store::Write { buffer, .. } if *buffer == value));
-    let elementwise =
-        region.body.iter().all(|i| match &i.op {
+    // A scan looks at other elements of its line.
+    let elementwise = !region.whole
+        && region.body.iter().all(|i| match &i.op {
             RegionOp::Load(b) => *b != old || i.axes == region.domain,
             RegionOp::Take { table, .. } => *table != old,
             RegionOp::Linear(w) => w.buffer != old,
             _ => true,
-        }) && !region.body.iter().any(|i| matches!(i.op, RegionOp::Pick(_)) && region.grain == region::Grain::Lane);
+        })
+        && !region.body.iter().any(|i| matches!(i.op, RegionOp::Pick(_)) && region.grain == region::Grain::Lane);
     let later = launches[writer + 1..].iter().any(|l| l.region.reads().contains(&old));
     whole && elementwise && !later
 }

@@ -45,9 +45,4 @@ impl NeuralImage {
     pub fn parameters(&self) -> Vec<Parameter> {
         self.network.parameters.clone()
     }
-
-    /// Weights of all layers, for counting operations: a multiplication and an addition each.
-    pub fn weights(&self) -> usize {
-        crate::planar::weights(&self.parameters())
-    }
 }

@@ -1,8 +1,12 @@
 //! Planar registration: patches of one photo, distorted by unknown warps, are aligned while a neural image is learned
 //! from them.
 
+pub mod data;
 pub mod model;
 pub mod rates;
+pub mod trainer;
 
+pub use data::{DataError, PlanarData};
 pub use model::{PlanarModel, weights};
 pub use rates::Rates;
+pub use trainer::{Evaluation, Trainer};

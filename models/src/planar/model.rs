@@ -27,8 +27,10 @@ use std::sync::Arc;
 pub const GRID: &str = "data.grid";
 /// Colours of the distorted patches, `[frame, pixel] x 3`.
 pub const TARGET: &str = "data.target";
-/// Coordinates at which [`PlanarModel::picture`] looks, `[pixel] x 2`.
-pub const VIEW: &str = "data.view";
+/// Coordinates at which [`PlanarModel::picture`] looks, `[view] x 2`.
+pub fn view(pixels: usize) -> String {
+    format!("data.view.{pixels}")
+}
 /// What tells the pixel draws of two seeds apart.
 pub const SEED: &str = "data.seed";
 
@@ -77,7 +79,8 @@ impl PlanarModel {
         6.0 * rows as f64 * (weights(&self.parameters())) as f64
     }
 
-    /// One training step: outputs `render`, `alignment`, `total` and `transform`, and an update of every parameter.
+    /// One training step: outputs `render`, `total`, `transform` and, where the warp has
+    /// one, `alignment`; and an update of every parameter.
     #[track_caller]
     pub fn train_step(&self) -> Step {
         let (at, target) = match self.settings.data.points_per_patch {
@@ -85,8 +88,7 @@ impl PlanarModel {
             Count::Of(points) => self.drawn_points(points),
         };
         let (found, render) = self.losses(&at, &target);
-        let weight = self.settings.loss.alignment;
-        let total = if weight > 0.0 { &render + &found.residual * weight } else { render.clone() };
+        let total = self.total(&found, &render);
         Step { outputs: losses_and_transform(&found, render, &total), updates: self.updates(&total) }
     }
 
@@ -98,7 +100,7 @@ impl PlanarModel {
         let found = self.register(&at);
         let color = self.field.color(&found.local, &progress());
         let render = mean_squared_error(&color, &self.target());
-        let total = &render + &found.residual * self.settings.loss.alignment;
+        let total = self.total(&found, &render);
         let fields = [("local", &found.local), ("global", &found.global), ("color", &color)];
         let all = Axes::new([self.frame.clone(), self.pixel.clone()]);
         let fields = fields.map(|(name, t)| (name.to_string(), t.broadcast_to(&all)));
@@ -109,7 +111,7 @@ impl PlanarModel {
     /// The learned picture at `pixels` points: output `color`.
     #[track_caller]
     pub fn picture(&self, pixels: usize) -> Step {
-        let view = Tensor::data(VIEW, Shape::new(&[&Axis::new("view", pixels)], 2));
+        let view = Tensor::data(view(pixels), Shape::new(&[&Axis::new("view", pixels)], 2));
         let color = self.field.color(&view, &progress());
         Step { outputs: vec![("color".to_string(), color)], updates: vec![] }
     }
@@ -120,6 +122,16 @@ impl PlanarModel {
         let color = self.field.color(&found.local, &progress());
         let render = mean_squared_error(&color, target);
         (found, render)
+    }
+
+    /// A weight of zero removes the alignment term: its gradient is not even computed.
+    #[track_caller]
+    fn total(&self, found: &Registration, render: &Tensor) -> Tensor {
+        let weight = self.settings.loss.alignment;
+        match &found.residual {
+            Some(residual) if weight > 0.0 => render + residual * weight,
+            _ => render.clone(),
+        }
     }
 
     #[track_caller]
@@ -192,13 +204,9 @@ fn progress() -> Tensor {
 }
 
 fn losses_and_transform(found: &Registration, render: Tensor, total: &Tensor) -> Vec<(String, Tensor)> {
-    let outputs = [
-        ("render", render),
-        ("alignment", found.residual.clone()),
-        ("total", total.clone()),
-        ("transform", found.transform.clone()),
-    ];
-    outputs.map(|(name, t)| (name.to_string(), t)).into()
+    let mut outputs = vec![("render", render), ("total", total.clone()), ("transform", found.transform.clone())];
+    outputs.extend(found.residual.clone().map(|r| ("alignment", r)));
+    outputs.into_iter().map(|(name, t)| (name.to_string(), t)).collect()
 }
 
 /// Entries of all weight matrices among the parameters, biases and codes left out.

@@ -16,8 +16,9 @@ pub struct WriteError {
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
     let refuse = |source| WriteError { path: path.to_path_buf(), source };
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut file = NamedTempFile::with_prefix_in(".raygrad-", folder).map_err(refuse)?;
-    file.write_all(bytes).and_then(|()| file.as_file().sync_all()).map_err(refuse)?;
+    let file = NamedTempFile::with_prefix_in(".raygrad-", folder).map_err(refuse)?;
+    let mut plain = file.as_file();
+    plain.write_all(bytes).and_then(|()| plain.sync_all()).map_err(refuse)?;
     make_readable(file.as_file()).map_err(refuse)?;
     file.persist(path).map_err(|e| refuse(e.error))?;
     sync_folder(folder).map_err(refuse)

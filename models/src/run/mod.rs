@@ -4,6 +4,7 @@ pub mod checkpoint;
 pub mod files;
 pub mod folder;
 pub mod metrics;
+pub mod results;
 
 pub use checkpoint::{Checkpoint, CheckpointError};
 pub use folder::{FolderError, RunFolder};

@@ -11,7 +11,7 @@ mod local;
 
 pub use fit::fit_global;
 pub use global::GlobalWarp;
-pub use known::KnownWarp;
+pub use known::{KnownWarp, TRUTH as KNOWN_TRUTH};
 pub use local::LocalWarp;
 
 use crate::config::{Dof, Method, Settings, Solver};
@@ -103,8 +103,8 @@ pub struct Registration {
     pub transform: Tensor,
     /// Field points under the global transform.
     pub global: Tensor,
-    /// Mean of (local - global)^2 over frames, points and coordinates.
-    pub residual: Tensor,
+    /// Mean of (local - global)^2 over frames, points and coordinates; none where the map is the global transform.
+    pub residual: Option<Tensor>,
 }
 
 impl Registration {
@@ -116,14 +116,11 @@ impl Registration {
         let mapped = warp.map(at, code);
         let local = if held { first.select(&at.xy, &mapped) } else { mapped };
         match warp.global(&at.frame, code) {
-            Some(transform) => {
-                let residual = Tensor::scalar(0.0);
-                Registration { global: local.clone(), local, transform, residual }
-            }
+            Some(transform) => Registration { global: local.clone(), local, transform, residual: None },
             None => {
                 let transform = fit_global(warp.dof(), warp.solver(), at, &local, held.then_some(&first));
                 let global = apply_homography(&transform, &at.xy);
-                let residual = mean_squared_error(&local, &global);
+                let residual = Some(mean_squared_error(&local, &global));
                 Registration { local, transform, global, residual }
             }
         }

@@ -2,7 +2,7 @@
 
 use super::values::{Values, is_alias};
 use super::*;
-use crate::cpu::{ROW_BLOCK, outer_len, panel_len, row_stride};
+use crate::cpu::{ROW_BLOCK, outer, outer_len, panel_len, row_stride};
 use raygrad_compiler::graph::Axis;
 use raygrad_compiler::plan::Program;
 use raygrad_compiler::plan::region::{Inst, InstId, Region, RegionOp, Store};
@@ -66,6 +66,14 @@ fn empty(inner: usize, rows: usize, ld: usize) -> TileProgram {
         direct: false,
         chunks: 1,
     }
+}
+
+/// A layer and what its only reader does with it.
+struct FusedLayer {
+    layer: InstId,
+    /// Values added to every row.
+    biases: Vec<InstId>,
+    epilogue: LayerEpilogue,
 }
 
 struct Lowering<'a> {
@@ -137,8 +145,8 @@ impl Lowering<'_> {
                 self.keep(id);
             }
             RegionOp::Map(program) => {
-                if let Some((layer, bias, epilogue)) = self.layer_of(id) {
-                    return self.layer_as(id, layer, bias, epilogue);
+                if let Some(fused) = self.layer_of(id) {
+                    return self.layer_as(id, &fused);
                 }
                 self.map(id, inst, program, full);
             }
@@ -252,7 +260,7 @@ impl Lowering<'_> {
 
     /// A layer without a value yet whose only reader is a pointwise program that the matrix kernel can apply itself. The
     /// program's other operands are known.
-    fn layer_of(&self, id: InstId) -> Option<(InstId, Option<InstId>, LayerEpilogue)> {
+    fn layer_of(&self, id: InstId) -> Option<FusedLayer> {
         let inst = self.region.inst(id);
         let RegionOp::Map(program) = &inst.op else { return None };
         let mut unknown = inst.inputs.iter().filter(|i| !self.values.known(**i));
@@ -266,41 +274,38 @@ impl Lowering<'_> {
             return None;
         }
         let at = |i: InstId| Val::Input(inst.inputs.iter().position(|x| *x == i).unwrap_or_default() as u8);
+        let others: Vec<InstId> = inst.inputs.iter().copied().filter(|i| *i != layer).collect();
         let (y, zero) = (at(layer), Val::Const(0));
+        if let ([(Prim::Lt, lt), (Prim::Select, select)], [h]) = (&program.code[..], &others[..])
+            && *lt == [zero, at(*h)]
+            && *select == [Val::Inst(0), y, zero]
+            && !self.region.is_uniform(*h)
+            && self.region.inst(*h).channels == inst.channels
+        {
+            let h = self.values.contiguous(self.values.get(*h))?;
+            return Some(FusedLayer { layer, biases: vec![], epilogue: LayerEpilogue::Mask(h) });
+        }
+        // Sums of the layer and values that do not vary along the tile, rectified or not.
         let is_bias = |i: &InstId| {
             self.region.is_uniform(*i)
                 && self.region.inst(*i).channels == inst.channels
                 && self.values.contiguous(self.values.get(*i)).is_some()
         };
-        let code = &program.code;
-        let adds = |args: &[Val], b: InstId| args == [y, at(b)] || args == [at(b), y];
-        if let [(Prim::Max, args)] = &code[..]
-            && *args == [y, zero]
-        {
-            return Some((layer, None, LayerEpilogue::Relu));
-        }
-        let other = *inst.inputs.iter().find(|i| **i != layer)?;
-        match &code[..] {
-            [(Prim::Add, args)] if adds(args, other) && is_bias(&other) => {
-                Some((layer, Some(other), LayerEpilogue::None))
+        let (adds, epilogue) = match program.code.split_last()? {
+            ((Prim::Max, args), adds) => {
+                let rectified = adds.len().checked_sub(1).map_or(y, |last| Val::Inst(last as u16));
+                (*args == [rectified, zero]).then_some((adds, LayerEpilogue::Relu))?
             }
-            [(Prim::Add, args), (Prim::Max, max)]
-                if adds(args, other) && is_bias(&other) && *max == [Val::Inst(0), zero] =>
-            {
-                Some((layer, Some(other), LayerEpilogue::Relu))
-            }
-            [(Prim::Lt, lt), (Prim::Select, select)]
-                if inst.inputs.len() == 2
-                    && *lt == [zero, at(other)]
-                    && *select == [Val::Inst(0), y, zero]
-                    && !self.region.is_uniform(other)
-                    && self.region.inst(other).channels == inst.channels =>
-            {
-                let h = self.values.contiguous(self.values.get(other))?;
-                Some((layer, None, LayerEpilogue::Mask(h)))
-            }
-            _ => None,
-        }
+            _ => (&program.code[..], LayerEpilogue::None),
+        };
+        let terms: Vec<Val> = adds.iter().flat_map(|(_, args)| args.iter().copied()).collect();
+        let once = |v: Val| terms.iter().filter(|t| **t == v).count() == 1;
+        let plain_sum = adds.iter().all(|(prim, _)| *prim == Prim::Add)
+            && others.iter().all(|i| once(at(*i)))
+            && (adds.is_empty() || once(y))
+            && (1..adds.len()).all(|i| once(Val::Inst(i as u16 - 1)))
+            && !terms.iter().any(|t| matches!(t, Val::Const(_)));
+        (plain_sum && others.iter().all(is_bias)).then_some(FusedLayer { layer, biases: others, epilogue })
     }
 
     /// Whether `id` is a layer that its only reader computes, see [`Lowering::layer_of`]. Its operand stays alive till then.
@@ -312,15 +317,53 @@ impl Lowering<'_> {
         user.and_then(|user| self.layer_of(user)).is_some()
     }
 
-    /// Computes `layer` with an epilogue as the value of `id`.
-    fn layer_as(&mut self, id: InstId, layer: InstId, bias: Option<InstId>, epilogue: LayerEpilogue) {
-        let bias = bias.and_then(|b| self.values.contiguous(self.values.get(b)));
-        self.layer(id, layer, bias, epilogue);
+    /// Computes a layer with its epilogue as the value of `id`.
+    fn layer_as(&mut self, id: InstId, fused: &FusedLayer) {
+        let mut sum = None;
+        let place = |v: &Values, b: &InstId| v.contiguous(v.get(*b));
+        let mut bias = fused.biases.first().and_then(|b| place(&self.values, b));
+        if fused.biases.len() > 1 {
+            let channels = self.region.inst(id).channels;
+            let (to, lanes) = self.values.temporary(channels, false);
+            for other in fused.biases[1..].iter().filter_map(|b| place(&self.values, b)) {
+                let add = ScalarProgram { code: vec![(Prim::Add, vec![Val::Input(0), Val::Input(1)])] };
+                let args = vec![RunArg::Lanes(bias.unwrap_or(to)), RunArg::Lanes(other)];
+                let runs = vec![Run { out: to, channels, args }];
+                self.out.ops.push(TileOp::Map { program: lane_program(&add), runs, full: false });
+                bias = Some(to);
+            }
+            sum = Some((to, lanes));
+        }
+        self.layer(id, fused.layer, bias, fused.epilogue);
+        sum.into_iter().for_each(|s| self.values.release_temporary(s));
         // The layer's operand was held for this moment; the layer itself never had a value.
-        self.values.done(self.region.inst(layer).inputs[0]);
-        for input in self.region.inst(id).inputs.iter().filter(|i| **i != layer) {
+        self.values.done(self.region.inst(fused.layer).inputs[0]);
+        for input in self.region.inst(id).inputs.iter().filter(|i| **i != fused.layer) {
             self.values.done(*input);
         }
+    }
+
+    /// Stretches of neighbouring channels of a full value: first place, first channel, channels.
+    fn stretches(&self, id: InstId) -> Vec<(Place, usize, usize)> {
+        let value = self.values.get(id);
+        let mut all: Vec<(Place, usize, usize)> = vec![];
+        for (c, place) in value.places.iter().enumerate() {
+            match all.last_mut() {
+                Some((first, _, n)) if *first + (*n * self.out.ld) as Place == *place => *n += 1,
+                _ => all.push((*place, c, 1)),
+            }
+        }
+        all
+    }
+
+    /// The stretches of a wide full value that is not worth copying together, if `usable` says they can be used apart.
+    fn apart(&self, id: InstId, usable: impl Fn(usize) -> bool) -> Option<Vec<(Place, usize, usize)>> {
+        let value = self.values.get(id);
+        if !value.full || value.places.len() < WIDE || self.values.contiguous(value).is_some() {
+            return None;
+        }
+        let all = self.stretches(id);
+        (all.len() <= 4 && all.iter().all(|(_, first, _)| usable(*first))).then_some(all)
     }
 
     fn layer(&mut self, id: InstId, layer: InstId, bias: Option<Place>, epilogue: LayerEpilogue) {
@@ -328,11 +371,26 @@ impl Lowering<'_> {
         let RegionOp::Linear(weights) = inst.op else { unreachable!("only layers are passed here") };
         let full = !self.region.is_uniform(layer);
         let contraction = if weights.transposed { weights.columns } else { weights.rows };
-        let (x, copy) = self.side_by_side(inst.inputs[0], full);
-        let out = self.values.create(id, inst.channels, full);
-        let pack = self.pack(weights, contraction, inst.channels);
         let outputs = inst.channels;
-        self.out.ops.push(TileOp::Layer { x, contraction, pack, bias, epilogue, out, outputs, full });
+        // Rows of untransposed weights are a matrix of their own: one product per stretch of the operand.
+        if let Some(parts) = self.apart(inst.inputs[0], |_| !weights.transposed) {
+            let out = self.values.create(id, outputs, full);
+            let last = parts.len() - 1;
+            for (i, (x, first, n)) in parts.into_iter().enumerate() {
+                let rows = Weights { first: weights.first + first * weights.columns, rows: n, ..weights };
+                let pack = self.pack(rows, n, outputs);
+                let epilogue = if i == last { epilogue } else { LayerEpilogue::None };
+                let bias = if i == 0 { bias } else { None };
+                let op = Layer { x, contraction: n, pack, bias, accumulate: i > 0, epilogue, out, outputs, full };
+                self.out.ops.push(TileOp::Layer(op));
+            }
+            return;
+        }
+        let (x, copy) = self.side_by_side(inst.inputs[0], full);
+        let out = self.values.create(id, outputs, full);
+        let pack = self.pack(weights, contraction, outputs);
+        let op = Layer { x, contraction, pack, bias, accumulate: false, epilogue, out, outputs, full };
+        self.out.ops.push(TileOp::Layer(op));
         copy.into_iter().for_each(|c| self.values.release_temporary(c));
     }
 
@@ -369,11 +427,16 @@ impl Lowering<'_> {
                 TileStore::Reduce { kind: *kind, value: self.values.get(*value).clone(), view, at }
             }
             Store::Outer { x, d, buffer } => {
-                let ((x_place, x_copy), (d_place, d_copy)) = (self.side_by_side(*x, true), self.side_by_side(*d, true));
-                copies.extend(x_copy.into_iter().chain(d_copy));
                 let (k, n) = (self.region.inst(*x).channels, self.region.inst(*d).channels);
                 let at = self.accumulator(*buffer, Reduction::Sum, Some((k, n, view.elements)));
-                TileStore::Outer { x: x_place, k, d: d_place, n, view, at }
+                let (d, d_copy) = self.side_by_side(*d, true);
+                copies.extend(d_copy);
+                let parts = self.apart(*x, |first| first % outer::BLOCK == 0).unwrap_or_else(|| {
+                    let (place, x_copy) = self.side_by_side(*x, true);
+                    copies.extend(x_copy);
+                    vec![(place, 0, k)]
+                });
+                TileStore::Outer { parts, k, d, n, view, at }
             }
             Store::Scatter { value, index, axis, buffer } => {
                 let (axis_stride, axis_size) = self.axis_stride(*buffer, axis);
@@ -402,8 +465,9 @@ impl Lowering<'_> {
         };
         let positions = self.out.outer.iter().product::<usize>();
         self.out.direct = positions >= 2 * MAX_CHUNKS && self.out.ops.iter().all(per_outer);
-        let units = if self.out.direct { positions } else { self.out.tiles() };
-        self.out.chunks = units.clamp(1, MAX_CHUNKS);
+        let units = if self.out.direct { positions } else { self.out.tiles() }.max(1);
+        // A chunk's accumulators are worth a few tiles of work each.
+        self.out.chunks = (units / CHUNK_TILES).next_power_of_two().clamp(units.min(2), MAX_CHUNKS);
         self.out
     }
 }

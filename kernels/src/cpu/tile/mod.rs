@@ -25,6 +25,10 @@ const LAYER_ROWS: usize = 192;
 const PLAIN_ROWS: usize = 1024;
 /// Chunks a launch is cut into at most. Fixed, so that sums do not depend on the number of threads.
 const MAX_CHUNKS: usize = 16;
+/// Tiles that a chunk should have at least, if that leaves two chunks.
+const CHUNK_TILES: usize = 4;
+/// Channels from which an operand in pieces is multiplied piece by piece instead of being put together first.
+const WIDE: usize = 64;
 /// Lanes that a pointwise program works on at a time: its temporaries stay in L1.
 const BLOCK: usize = 512;
 
@@ -93,6 +97,22 @@ pub enum LayerEpilogue {
     Mask(Place),
 }
 
+/// A layer on a tile.
+#[derive(Clone, Debug)]
+pub struct Layer {
+    pub x: Place,
+    pub contraction: usize,
+    /// Index of its packed weights.
+    pub pack: usize,
+    pub bias: Option<Place>,
+    /// Adds to what is there.
+    pub accumulate: bool,
+    pub epilogue: LayerEpilogue,
+    pub out: Place,
+    pub outputs: usize,
+    pub full: bool,
+}
+
 /// One operation on a tile.
 #[derive(Clone, Debug)]
 pub enum TileOp {
@@ -126,16 +146,7 @@ pub enum TileOp {
         to: Place,
         full: bool,
     },
-    Layer {
-        x: Place,
-        contraction: usize,
-        pack: usize,
-        bias: Option<Place>,
-        epilogue: LayerEpilogue,
-        out: Place,
-        outputs: usize,
-        full: bool,
-    },
+    Layer(Layer),
     RowLinear {
         x: Value,
         w: Value,
@@ -200,7 +211,8 @@ pub enum TileStore {
     },
     /// Blocked accumulators (see [`super::outer`]), one per element of the buffer, at `at`.
     Outer {
-        x: Place,
+        /// Stretches of x: place, first channel, channels.
+        parts: Vec<(Place, usize, usize)>,
         k: usize,
         d: Place,
         n: usize,

@@ -158,9 +158,7 @@ impl Tile<'_> {
                         }
                     }
                 }
-                TileOp::Layer { x, contraction, pack, bias, epilogue, out, outputs, full } => {
-                    self.layer(*x, *contraction, *pack, *bias, *epilogue, *out, *outputs, *full);
-                }
+                TileOp::Layer(layer) => self.layer(layer),
                 TileOp::RowLinear { x, w, rows, columns, transposed, out, full } => {
                     self.row_linear(x, w, (*rows, *columns), *transposed, *out, *full);
                 }
@@ -285,18 +283,8 @@ impl Tile<'_> {
         }
     }
 
-    #[allow(clippy::too_many_arguments, reason = "the fields of one operation")]
-    unsafe fn layer(
-        &self,
-        x: Place,
-        contraction: usize,
-        pack: usize,
-        bias: Option<Place>,
-        epilogue: LayerEpilogue,
-        out: Place,
-        outputs: usize,
-        full: bool,
-    ) {
+    unsafe fn layer(&self, layer: &Layer) {
+        let Layer { x, contraction, pack, bias, accumulate, epilogue, out, outputs, full } = *layer;
         let pack = &self.program.packs[pack];
         let element: usize = self.position.iter().zip(&pack.view.outer).map(|(p, s)| p * s).sum();
         let panels = self.packed.wrapping_add(pack.at + element * pack.len);
@@ -324,7 +312,7 @@ impl Tile<'_> {
             panels,
             outputs,
             bias: bias.map_or(std::ptr::null(), |b| self.at(b).cast_const()),
-            accumulate: false,
+            accumulate,
             epilogue: match epilogue {
                 LayerEpilogue::None => Epilogue::None,
                 LayerEpilogue::Relu => Epilogue::Relu,
@@ -438,20 +426,26 @@ impl Tile<'_> {
                     }
                 }
                 TileStore::Reduce { kind, value, view, at } => self.reduce(*kind, value, view, *at),
-                TileStore::Outer { x, k, d, n, view, at } => {
+                TileStore::Outer { parts, k, d, n, view, at } => {
                     let ld = self.program.ld;
                     let rows = self.rows.next_multiple_of(16);
-                    for (base, channels) in [(x, k), (d, n)] {
-                        for c in 0..*channels {
-                            let padding = self.at(*base).add(c * ld + self.rows);
-                            std::slice::from_raw_parts_mut(padding, rows - self.rows).fill(0.0);
-                        }
-                    }
                     let element: usize = self.position.iter().zip(&view.outer).map(|(p, s)| p * s).sum();
                     let g = self.accumulators.add(at + element * crate::cpu::outer_len(*k, *n));
-                    let args =
-                        crate::cpu::Outer { x: self.at(*x), ldx: ld, k: *k, d: self.at(*d), ldd: ld, n: *n, rows, g };
-                    outer(self.isa, args);
+                    self.clear_padding(*d, *n, rows);
+                    for (x, first, channels) in parts {
+                        self.clear_padding(*x, *channels, rows);
+                        let args = crate::cpu::Outer {
+                            x: self.at(*x),
+                            ldx: ld,
+                            k: *channels,
+                            d: self.at(*d),
+                            ldd: ld,
+                            n: *n,
+                            rows,
+                            g: g.add(crate::cpu::outer_len(*first, *n)),
+                        };
+                        outer(self.isa, args);
+                    }
                 }
                 TileStore::Scatter { value, index, axis_stride, axis_size, view, at } => {
                     let base = self.accumulators.add(at + self.offset(view));
@@ -464,6 +458,15 @@ impl Tile<'_> {
                     }
                 }
             }
+        }
+    }
+
+    /// Zeroes the padding of some channels up to `rows`: rows that are summed over must all count.
+    unsafe fn clear_padding(&self, first: Place, channels: usize, rows: usize) {
+        for c in 0..channels {
+            let padding = self.at(first).wrapping_add(c * self.program.ld + self.rows);
+            // SAFETY: a full channel has `ld` lanes, at least `rows`.
+            unsafe { std::slice::from_raw_parts_mut(padding, rows - self.rows).fill(0.0) };
         }
     }
 

@@ -1,1 +1,124 @@
-fn main() {}
+//! The command `raygrad`.
+//!
+//! Exit codes: 0 done, 1 the computation failed, 2 something given was wrong (or could not be written), 130 interrupted
+//! with a checkpoint.
+
+mod bench;
+mod explain;
+mod progress;
+mod train;
+
+use clap::{Args, Parser, Subcommand};
+use raygrad::config::PRESETS;
+use raygrad::run::files::WriteError;
+use raygrad::{Error, Experiment};
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+/// Differentiable rendering: train, explain and time neural fields and warps.
+#[derive(Parser)]
+#[command(version, propagate_version = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Train an experiment and write its results into a run folder.
+    Train(train::TrainArgs),
+    /// List what programs can run on.
+    Devices,
+    /// List the built-in experiments.
+    Presets,
+    /// Print what an experiment compiles to: launches, what is fused, stored and recomputed, operations and bytes.
+    Explain(explain::ExplainArgs),
+    /// Time the training step of an experiment.
+    Bench(bench::BenchArgs),
+}
+
+/// What names an experiment.
+#[derive(Args)]
+struct Choice {
+    /// A preset (see `raygrad presets`) or a settings file ending in `.toml`.
+    preset: String,
+    /// Override a setting, as in `--set optim.steps=1000`. May be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// PNG or JPEG file to take the patches from, instead of the built-in photo.
+    #[arg(long, value_name = "FILE")]
+    image: Option<String>,
+    /// Seed of perturbation, initial weights and pixel draws.
+    #[arg(long, value_name = "N")]
+    seed: Option<String>,
+    /// Where to compute: `auto`, `cpu`, `wgpu`, or `wgpu:N` for the Nth adapter.
+    #[arg(long, value_name = "DEVICE")]
+    device: Option<String>,
+    /// Threads of the CPU backend. Results do not depend on them.
+    #[arg(long, value_name = "N")]
+    threads: Option<String>,
+}
+
+impl Choice {
+    /// The experiment with all overrides; options of their own win over `--set`.
+    fn experiment(&self) -> Result<Experiment, Error> {
+        let mut experiment = Experiment::preset(&self.preset)?;
+        for assignment in &self.set {
+            experiment = experiment.set(assignment)?;
+        }
+        let options = [
+            ("--image", "data.image", &self.image),
+            ("--seed", "run.seed", &self.seed),
+            ("--device", "run.device", &self.device),
+            ("--threads", "run.threads", &self.threads),
+        ];
+        for (option, key, value) in options {
+            if let Some(value) = value {
+                experiment.set_option(option, key, value)?;
+            }
+        }
+        Ok(experiment)
+    }
+}
+
+fn main() -> ExitCode {
+    let done = match Cli::parse().command {
+        Command::Train(args) => train::run(&args),
+        Command::Devices => devices(),
+        Command::Presets => presets(),
+        Command::Explain(args) => explain::run(&args),
+        Command::Bench(args) => bench::run(&args),
+    };
+    match done {
+        Ok(code) => code,
+        Err(error) => {
+            let bad_input = error.downcast_ref::<Error>().map(Error::is_bad_input);
+            match bad_input {
+                // These name their causes themselves.
+                Some(_) => eprintln!("error: {error}"),
+                None => eprintln!("error: {error:#}"),
+            }
+            ExitCode::from(if bad_input == Some(true) { 2 } else { 1 })
+        }
+    }
+}
+
+fn devices() -> anyhow::Result<ExitCode> {
+    for device in raygrad::Device::list() {
+        println!("{:<10} {}  ({}; {})", device.id, device.name, device.backend, device.details);
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn presets() -> anyhow::Result<ExitCode> {
+    let width = PRESETS.iter().map(|p| p.name.len()).max().unwrap_or(0);
+    for preset in PRESETS {
+        println!("{:width$}  {}", preset.name, preset.summary());
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// A folder given for output, made if it is not there.
+fn output_folder(path: &PathBuf) -> Result<(), Error> {
+    std::fs::create_dir_all(path).map_err(|source| WriteError { path: path.clone(), source }.into())
+}

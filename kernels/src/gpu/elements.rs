@@ -1,0 +1,298 @@
+//! Kernels that write values element by element.
+//!
+//! The stores of a region fall into components that share computed values. A component runs either row by row (an
+//! invocation computes all channels of one element, unrolled) or lane by lane (an invocation computes one channel of one
+//! element, indexed): rows where channels share work, lanes where elements are few or channels many. The components of
+//! a region are segments of one kernel.
+
+use super::builder::Value;
+use super::channels::is_indexable;
+use super::eval::{Channel, Values};
+use super::layout::{Layout, Limits};
+use super::memory::{Emit, Position, WORKGROUP};
+use super::{Kernel, LowerError};
+use raygrad_compiler::plan::region::{InstId, Region, RegionOp, Store};
+
+/// Elements from which rows alone fill a device.
+const MANY: usize = 4096;
+/// Most channels that are unrolled.
+const WIDE: usize = 64;
+/// Instructions from which unrolling is worth avoiding.
+const LONG: usize = 2000;
+/// Most segments of one kernel.
+const MAX_SEGMENTS: usize = 24;
+
+/// Stores that share an invocation.
+struct Component {
+    stores: Vec<usize>,
+    by_lane: bool,
+    /// Unrolled instructions, about.
+    size: usize,
+}
+
+/// Which instructions `roots` need.
+pub(super) fn closure(region: &Region, roots: impl IntoIterator<Item = InstId>) -> Vec<bool> {
+    let mut needed = vec![false; region.body.len()];
+    roots.into_iter().for_each(|r| needed[r.0 as usize] = true);
+    for at in (0..region.body.len()).rev() {
+        if needed[at] {
+            region.body[at].inputs.iter().for_each(|i| needed[i.0 as usize] = true);
+        }
+    }
+    needed
+}
+
+/// Scalar instructions for one channel of an instruction, its operands given.
+pub(super) fn own_cost(region: &Region, at: usize) -> usize {
+    let inst = &region.body[at];
+    match &inst.op {
+        RegionOp::Map(p) => p.flops() as usize,
+        RegionOp::ChannelSum(groups) => groups.iter().map(Vec::len).sum::<usize>().div_ceil(inst.channels),
+        RegionOp::ChannelMax => region.inst(inst.inputs[0]).channels,
+        RegionOp::Linear(w) => {
+            if w.transposed {
+                w.columns
+            } else {
+                w.rows
+            }
+        }
+        RegionOp::RowLinear { rows, columns, transposed } => {
+            if *transposed {
+                *columns
+            } else {
+                *rows
+            }
+        }
+        RegionOp::SymEig { n } => 60 * n,
+        _ => 1,
+    }
+}
+
+/// Scalar instructions for one channel, operands included, each computed for it alone.
+fn lane_costs(region: &Region) -> Vec<usize> {
+    let mut costs: Vec<usize> = vec![];
+    for (at, inst) in region.body.iter().enumerate() {
+        let own = own_cost(region, at);
+        let times = match inst.op {
+            RegionOp::ChannelSum(_) | RegionOp::ChannelMax | RegionOp::Linear(_) | RegionOp::RowLinear { .. } => own,
+            _ => 1,
+        };
+        let operands = inst.inputs.iter().map(|i| costs[i.0 as usize].saturating_mul(times));
+        costs.push(operands.fold(own, usize::saturating_add));
+    }
+    costs
+}
+
+fn components(region: &Region) -> Vec<Component> {
+    let count = region.stores.len();
+    let closures: Vec<Vec<bool>> = region.stores.iter().map(|s| closure(region, s.values())).collect();
+    let written: Vec<_> = region.stores.iter().map(Store::buffer).collect();
+    let elements = region.domain.elements();
+    let mut group: Vec<usize> = (0..count).collect();
+    let join = |group: &mut Vec<usize>, a: usize, b: usize| {
+        let (from, to) = (group[a].max(group[b]), group[a].min(group[b]));
+        group.iter_mut().filter(|g| **g == from).for_each(|g| *g = to);
+    };
+    for a in 0..count {
+        for b in a + 1..count {
+            let shared = (0..region.body.len()).any(|i| {
+                let inst = &region.body[i];
+                let computed = !matches!(inst.op, RegionOp::Load(_) | RegionOp::Const(_) | RegionOp::Index(_));
+                closures[a][i]
+                    && closures[b][i]
+                    && computed
+                    && (inst.channels > 1 || elements >= MANY && own_cost(region, i) > 16)
+            });
+            // What is replaced in place must be read by the invocation that replaces it.
+            let reads = |x: usize, y: usize| {
+                (0..region.body.len())
+                    .any(|i| closures[x][i] && matches!(&region.body[i].op, RegionOp::Load(l) if *l == written[y]))
+            };
+            if shared || reads(a, b) || reads(b, a) {
+                join(&mut group, a, b);
+            }
+        }
+    }
+    let costs = lane_costs(region);
+    let mut all: Vec<Component> = vec![];
+    for g in 0..count {
+        let stores: Vec<usize> = (0..count).filter(|s| group[*s] == g).collect();
+        if stores.is_empty() {
+            continue;
+        }
+        let values: Vec<InstId> = stores.iter().flat_map(|s| region.stores[*s].values()).collect();
+        let needed = closure(region, values.iter().copied());
+        let row: usize = (0..region.body.len())
+            .filter(|i| needed[*i])
+            .map(|i| own_cost(region, i).saturating_mul(region.body[i].channels))
+            .sum();
+        let lane: usize = values.iter().map(|v| costs[v.0 as usize]).sum();
+        let channels = region.inst(values[0]).channels;
+        let possible = channels > 1
+            && values.iter().all(|v| region.inst(*v).channels == channels && is_indexable(region, *v))
+            && stays_in_lane(region, &needed, &stores.iter().map(|s| written[*s]).collect::<Vec<_>>());
+        let by_lane = possible
+            && if channels > WIDE {
+                lane < row.saturating_mul(4)
+            } else if elements < MANY {
+                channels >= 4 && lane <= row
+            } else {
+                row > LONG && lane.saturating_mul(channels) <= row.saturating_mul(2)
+            };
+        all.push(Component { stores, by_lane, size: if by_lane { lane } else { row } });
+    }
+    // Where rows fill the device, rows that load the same buffers are better off together.
+    if elements >= MANY {
+        let (lanes, rows): (Vec<Component>, Vec<Component>) = all.into_iter().partition(|c| c.by_lane);
+        all = lanes;
+        if !rows.is_empty() {
+            let size = rows.iter().map(|c| c.size).sum();
+            let mut stores: Vec<usize> = rows.into_iter().flat_map(|c| c.stores).collect();
+            stores.sort();
+            all.push(Component { stores, by_lane: false, size });
+        }
+    }
+    all
+}
+
+/// Whether every buffer that is replaced in place is only read in the lane that is written.
+fn stays_in_lane(region: &Region, needed: &[bool], written: &[raygrad_compiler::plan::region::BufferId]) -> bool {
+    // Per value, whether it depends on a replaced buffer; then all on the way must keep channels where they are.
+    let mut tainted = vec![false; region.body.len()];
+    for (at, inst) in region.body.iter().enumerate() {
+        if !needed[at] {
+            continue;
+        }
+        tainted[at] = matches!(&inst.op, RegionOp::Load(b) if written.contains(b));
+        for i in &inst.inputs {
+            if tainted[i.0 as usize] {
+                let aligned = matches!(inst.op, RegionOp::Map(_)) && region.inst(*i).channels == inst.channels;
+                if !aligned {
+                    return false;
+                }
+                tainted[at] = true;
+            }
+        }
+    }
+    true
+}
+
+/// Kernels for a region whose stores all write element by element.
+pub(super) fn kernels(layout: &Layout, limits: Limits, name: &str, region: &Region) -> Result<Vec<Kernel>, LowerError> {
+    let mut batches: Vec<Vec<Component>> = vec![];
+    for component in components(region) {
+        match batches.last_mut() {
+            Some(batch)
+                if batch.len() < MAX_SEGMENTS
+                    && batch.iter().map(|c| c.size).sum::<usize>() + component.size <= 4 * LONG =>
+            {
+                batch.push(component)
+            }
+            _ => batches.push(vec![component]),
+        }
+    }
+    let one = batches.len() == 1;
+    let mut all = vec![];
+    for (i, batch) in batches.iter().enumerate() {
+        let name = if one { name.to_string() } else { format!("{name}.{}", i + 1) };
+        all.push(kernel(layout, limits, name, region, batch)?);
+    }
+    Ok(all)
+}
+
+fn kernel(
+    layout: &Layout,
+    limits: Limits,
+    name: String,
+    region: &Region,
+    components: &[Component],
+) -> Result<Kernel, LowerError> {
+    let elements = region.domain.elements() as u64;
+    let count = |c: &Component| {
+        let channels = region.inst(region.stores[c.stores[0]].values()[0]).channels as u64;
+        if c.by_lane { elements * channels } else { elements }
+    };
+    if let [only] = components {
+        let (mut e, number) = Emit::over(layout, limits, count(only))?;
+        segment(&mut e, region, only, number);
+        return e.finish(name);
+    }
+    let padded = |c: &Component| count(c).next_multiple_of(WORKGROUP as u64);
+    let total = components.iter().map(padded).sum();
+    let (mut e, number) = Emit::over(layout, limits, total)?;
+    let mut first = 0;
+    for (i, component) in components.iter().enumerate() {
+        let end = first + padded(component);
+        if i + 1 < components.len() {
+            let end = e.b.u(end as u32);
+            let here = e.b.less(number, end);
+            e.b.open_if(here);
+        }
+        let start = e.b.u(first as u32);
+        let own = e.b.sub(number, start);
+        let spare = padded(component) != count(component);
+        if spare {
+            let count = e.b.u(count(component) as u32);
+            let inside = e.b.less(own, count);
+            e.b.open_if(inside);
+        }
+        segment(&mut e, region, component, own);
+        if spare {
+            e.b.close_if();
+        }
+        if i + 1 < components.len() {
+            e.b.open_else();
+        }
+        first = end;
+    }
+    (1..components.len()).for_each(|_| e.b.close_if());
+    e.finish(name)
+}
+
+/// The statements of one component for its invocation `number`.
+fn segment(e: &mut Emit, region: &Region, component: &Component, number: Value) {
+    let elements = region.domain.elements() as u32;
+    if component.by_lane {
+        let per_channel = e.b.u(elements);
+        let (channel, element) = (e.b.div(number, per_channel), e.b.rem(number, per_channel));
+        e.b.name(channel, "channel");
+        e.b.name(element, "element");
+        let mut values = Values::new(region, vec![Position::new(&region.domain, element)]);
+        let results: Vec<Value> = component
+            .stores
+            .iter()
+            .map(|s| values.channel(e, region.stores[*s].values()[0], Channel::Var(channel)))
+            .collect();
+        for (s, value) in component.stores.iter().zip(results) {
+            let buffer = region.stores[*s].buffer();
+            let at = e.index(buffer, channel, element);
+            e.store(buffer, at, value);
+        }
+        return;
+    }
+    let mut values = Values::new(region, vec![Position::new(&region.domain, number)]);
+    let reads = region.reads();
+    let in_place = component.stores.iter().any(|s| reads.contains(&region.stores[*s].buffer()));
+    let mut late = vec![];
+    for s in &component.stores {
+        let store = &region.stores[*s];
+        let (id, buffer) = (store.values()[0], store.buffer());
+        for c in 0..region.inst(id).channels as u32 {
+            let value = values.channel(e, id, Channel::At(c));
+            if in_place {
+                late.push((buffer, c, value));
+            } else {
+                write(e, buffer, c, number, value);
+            }
+        }
+    }
+    for (buffer, c, value) in late {
+        write(e, buffer, c, number, value);
+    }
+}
+
+fn write(e: &mut Emit, buffer: raygrad_compiler::plan::region::BufferId, c: u32, element: Value, value: Value) {
+    let c = e.b.u(c);
+    let at = e.index(buffer, c, element);
+    e.store(buffer, at, value);
+}

@@ -1,0 +1,213 @@
+//! A kernel being built: naga statements, the arenas it binds, and positions in the domain.
+
+use super::builder::{Builder, Kind, Memory, Value};
+use super::layout::{ArenaId, Layout, Limits, Place};
+use super::{Binding, Kernel, LowerError};
+use naga::BuiltIn;
+use raygrad_compiler::graph::{Axes, Axis};
+use raygrad_compiler::plan::region::BufferId;
+use raygrad_compiler::scalar::DType;
+
+/// Invocations in a workgroup, unless a kernel needs another number.
+pub(super) const WORKGROUP: u32 = 64;
+
+pub(super) struct Emit<'l, 'a> {
+    pub b: Builder,
+    pub layout: &'l Layout<'a>,
+    bound: Vec<(ArenaId, Memory, bool)>,
+    /// Workgroup number in a dispatch of one dimension.
+    pub workgroup: Value,
+    /// Number of the invocation in its workgroup.
+    pub invocation: Value,
+    groups: [u32; 3],
+}
+
+impl<'l, 'a> Emit<'l, 'a> {
+    /// Starts a kernel of `workgroups` workgroups.
+    pub fn new(layout: &'l Layout<'a>, limits: Limits, workgroups: u64, size: u32) -> Result<Emit<'l, 'a>, LowerError> {
+        let mut b = Builder::new(size);
+        let group = b.built_in("workgroup", BuiltIn::WorkGroupId);
+        let invocation = b.built_in("invocation", BuiltIn::LocalInvocationIndex);
+        let most = limits.max_workgroups as u64;
+        let rows = workgroups.div_ceil(most);
+        if rows > most {
+            return Err(LowerError::TooManyWorkgroups { workgroups });
+        }
+        let columns = workgroups.div_ceil(rows.max(1)).max(1);
+        let mut workgroup = b.component(group, 0);
+        if rows > 1 {
+            let (row, length) = (b.component(group, 1), b.u(columns as u32));
+            let before = b.mul(row, length);
+            workgroup = b.add(before, workgroup);
+        }
+        let groups = [columns as u32, rows.max(1) as u32, 1];
+        Ok(Emit { b, layout, bound: vec![], workgroup, invocation, groups })
+    }
+
+    /// Starts a kernel of `count` invocations; leaves the spare ones of the last workgroup. Returns its number, too.
+    pub fn over(layout: &'l Layout<'a>, limits: Limits, count: u64) -> Result<(Emit<'l, 'a>, Value), LowerError> {
+        let mut e = Emit::new(layout, limits, count.div_ceil(WORKGROUP as u64), WORKGROUP)?;
+        let size = e.b.u(WORKGROUP);
+        let first = e.b.mul(e.workgroup, size);
+        let number = e.b.add(first, e.invocation);
+        e.b.name(number, "number");
+        if e.groups[1] > 1 || count % WORKGROUP as u64 != 0 {
+            e.leave_from(number, count as u32);
+        }
+        Ok((e, number))
+    }
+
+    /// Ends invocations whose `number` is not below `count`.
+    pub fn leave_from(&mut self, number: Value, count: u32) {
+        let count = self.b.u(count);
+        let inside = self.b.binary(naga::BinaryOperator::GreaterEqual, number, count);
+        self.b.open_if(inside);
+        self.b.leave();
+        self.b.close_if();
+    }
+
+    fn memory(&mut self, place: Place, write: bool) -> Memory {
+        if let Some(known) = self.bound.iter_mut().find(|b| b.0 == place.arena) {
+            if write && !known.2 {
+                known.2 = true;
+                self.b.make_writable(known.1);
+            }
+            return known.1;
+        }
+        let arena = self.layout.arena(place.arena);
+        let memory = self.b.storage(&arena.name, arena.dtype.into());
+        if write {
+            self.b.make_writable(memory);
+        }
+        self.bound.push((place.arena, memory, write));
+        memory
+    }
+
+    /// Lane `index` of a buffer.
+    pub fn load(&mut self, buffer: BufferId, index: Value) -> Value {
+        let place = self.layout.place(buffer);
+        let memory = self.memory(place, false);
+        let offset = self.b.u(place.offset);
+        let at = self.b.add(index, offset);
+        self.b.load(memory, at)
+    }
+
+    pub fn store(&mut self, buffer: BufferId, index: Value, value: Value) {
+        let place = self.layout.place(buffer);
+        let memory = self.memory(place, true);
+        let offset = self.b.u(place.offset);
+        let at = self.b.add(index, offset);
+        self.b.store(memory, at, value);
+    }
+
+    /// Lane index of a channel of an element.
+    pub fn index(&mut self, buffer: BufferId, channel: Value, element: Value) -> Value {
+        let elements = self.layout.shape(buffer).axes.elements() as u32;
+        let stride = self.b.u(elements);
+        let plane = self.b.mul(channel, stride);
+        self.b.add(plane, element)
+    }
+
+    /// Validates the kernel.
+    pub fn finish(self, name: impl Into<String>) -> Result<Kernel, LowerError> {
+        let name = name.into();
+        let workgroup_size = self.b.workgroup_size;
+        let module = self.b.finish();
+        let mut validator =
+            naga::valid::Validator::new(naga::valid::ValidationFlags::all(), naga::valid::Capabilities::empty());
+        let info = validator
+            .validate(&module)
+            .map_err(|e| LowerError::Invalid { kernel: name.clone(), message: e.emit_to_string("") })?;
+        let bindings = self.bound.iter().map(|(arena, _, writable)| Binding { arena: *arena, writable: *writable });
+        Ok(Kernel { name, module, info, bindings: bindings.collect(), workgroups: self.groups, workgroup_size })
+    }
+
+    /// Whether the dispatch has more workgroups than were asked for.
+    pub fn spare_workgroups(&self) -> bool {
+        self.groups[1] > 1
+    }
+}
+
+/// Where an invocation is in the domain: numbers of elements of disjoint sets of axes, and single coordinates that
+/// override them.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Position {
+    numbers: Vec<(Axes, Value)>,
+    fixed: Vec<(Axis, Value)>,
+}
+
+impl Position {
+    /// Element `number` of `axes`.
+    pub fn new(axes: &Axes, number: Value) -> Position {
+        Position { numbers: vec![(axes.clone(), number)], fixed: vec![] }
+    }
+
+    /// Also element `number` of `axes`, none of which the position has.
+    pub fn and(mut self, axes: &Axes, number: Value) -> Position {
+        self.numbers.push((axes.clone(), number));
+        self
+    }
+
+    /// The same with another coordinate along `axis`, which the domain may lack.
+    pub fn with(mut self, axis: &Axis, coordinate: Value) -> Position {
+        self.fixed.retain(|f| f.0 != *axis);
+        self.fixed.push((axis.clone(), coordinate));
+        self
+    }
+
+    pub fn coordinate(&self, e: &mut Emit, axis: &Axis) -> Value {
+        if let Some((_, known)) = self.fixed.iter().find(|f| f.0 == *axis) {
+            return *known;
+        }
+        let Some((axes, number)) = self.numbers.iter().find(|n| n.0.contains(axis)) else { return e.b.u(0) };
+        let below: usize = axes.iter().skip_while(|a| *a != axis).skip(1).map(Axis::size).product();
+        let below_value = e.b.u(below as u32);
+        let mut coordinate = e.b.div(*number, below_value);
+        if below * axis.size() < axes.elements() {
+            let size = e.b.u(axis.size() as u32);
+            coordinate = e.b.rem(coordinate, size);
+        }
+        if coordinate != *number {
+            e.b.name(coordinate, &format!("at_{}", axis.name()));
+        }
+        coordinate
+    }
+
+    /// Number of the element of a buffer with the given axes.
+    pub fn element(&self, e: &mut Emit, axes: &Axes) -> Value {
+        if !axes.iter().any(|a| self.fixed.iter().any(|f| f.0 == *a)) && !axes.is_empty() {
+            for (own, number) in &self.numbers {
+                if let Some(part) = run_of_axes(e, own, *number, axes) {
+                    return part;
+                }
+            }
+        }
+        let mut sum = e.b.u(0);
+        for (axis, stride) in axes.iter().zip(axes.strides_in(axes)) {
+            let (coordinate, stride) = (self.coordinate(e, axis), e.b.u(stride as u32));
+            let part = e.b.mul(coordinate, stride);
+            sum = e.b.add(sum, part);
+        }
+        sum
+    }
+}
+
+/// Neighbouring axes out of those that `number` counts need one division and one remainder at most.
+fn run_of_axes(e: &mut Emit, own: &Axes, number: Value, axes: &Axes) -> Option<Value> {
+    let all: Vec<&Axis> = own.iter().collect();
+    let wanted: Vec<&Axis> = axes.iter().collect();
+    let at = all.windows(wanted.len()).position(|w| w == wanted)?;
+    let below: usize = all[at + wanted.len()..].iter().map(|a| a.size()).product();
+    let below_value = e.b.u(below as u32);
+    let mut part = e.b.div(number, below_value);
+    if below * axes.elements() < own.elements() {
+        let size = e.b.u(axes.elements() as u32);
+        part = e.b.rem(part, size);
+    }
+    Some(part)
+}
+
+/// The scalar type of a lane.
+pub(super) fn kind(dtype: DType) -> Kind {
+    dtype.into()
+}

@@ -1,0 +1,122 @@
+//! Launches lowered to naga modules: WGSL to read and for the web, SPIR-V for Vulkan, and naga's IR for wgpu.
+//!
+//! | module | what |
+//! |---|---|
+//! | `builder`, `naming` | naga IR, statement by statement |
+//! | `layout` | where buffers lie: a few arenas |
+//! | `memory` | a kernel being built: arenas bound, positions in the domain |
+//! | `channels`, `eval`, `scalar`, `eigen` | values of a region at a position |
+//! | `parts` | a region cut into what one kind of kernel does |
+//! | `elements`, `reduce`, `scatter`, `scan`, `layer`, `outer`, `tile` | the kinds of kernels |
+
+mod builder;
+mod channels;
+mod eigen;
+mod elements;
+mod eval;
+mod layer;
+mod layout;
+mod memory;
+mod naming;
+mod outer;
+mod parts;
+mod reduce;
+mod scalar;
+mod scan;
+mod scatter;
+mod tile;
+
+pub use layout::{Arena, ArenaId, Inputs, Limits, Place};
+
+use layout::Layout;
+use raygrad_compiler::graph::Shape;
+use raygrad_compiler::plan::Program;
+
+/// A buffer that a kernel binds, at its position in the list.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Binding {
+    pub arena: ArenaId,
+    pub writable: bool,
+}
+
+/// One dispatch.
+#[derive(Clone, Debug)]
+pub struct Kernel {
+    pub name: String,
+    /// Has one entry point, `main`.
+    pub module: naga::Module,
+    pub info: naga::valid::ModuleInfo,
+    /// Bindings of group 0, in order.
+    pub bindings: Vec<Binding>,
+    pub workgroups: [u32; 3],
+    pub workgroup_size: u32,
+}
+
+/// The dispatches of one launch, in order.
+#[derive(Clone, Debug)]
+pub struct GpuLaunch {
+    pub name: String,
+    pub kernels: Vec<Kernel>,
+}
+
+/// A program for a GPU.
+#[derive(Clone, Debug)]
+pub struct GpuProgram {
+    pub launches: Vec<GpuLaunch>,
+    /// Arenas of this program alone; those of the inputs are in [`Inputs`].
+    pub arenas: Vec<Arena>,
+    /// Places of the program's buffers with their numbers of lanes, by id.
+    pub places: Vec<(Place, usize)>,
+}
+
+#[derive(Debug, thiserror::Error)]
+pub enum LowerError {
+    #[error("`{buffer}` has {bytes} bytes, but the device binds at most {limit} at once")]
+    TooLarge { buffer: String, bytes: u64, limit: u64 },
+    #[error("input `{name}` is {first} in one program and {second} in another; one name is one buffer")]
+    Conflict { name: String, first: Box<Shape>, second: Box<Shape> },
+    #[error("a launch needs {workgroups} workgroups, more than the device can start at once")]
+    TooManyWorkgroups { workgroups: u64 },
+    #[error("kernel `{kernel}` is not valid: {message}")]
+    Invalid { kernel: String, message: String },
+    #[error("kernel `{kernel}` cannot be written: {message}")]
+    Write { kernel: String, message: String },
+}
+
+/// Lowers a program compiled for a GPU. Its inputs get places in `inputs` unless they have them already.
+pub fn lower(program: &Program, inputs: &mut Inputs, limits: &Limits) -> Result<GpuProgram, LowerError> {
+    let mut layout = Layout::new(program, inputs, limits)?;
+    let mut launches = vec![];
+    for launch in &program.launches {
+        layout.next_launch();
+        let kernels = parts::lower(&mut layout, *limits, launch)?;
+        launches.push(GpuLaunch { name: launch.name.clone(), kernels });
+    }
+    let places = layout.places(program.buffers.len());
+    Ok(GpuProgram { launches, arenas: layout.own, places })
+}
+
+impl Kernel {
+    pub fn wgsl(&self) -> Result<String, LowerError> {
+        let flags = naga::back::wgsl::WriterFlags::empty();
+        naga::back::wgsl::write_string(&self.module, &self.info, flags).map_err(|e| self.write_error(&e))
+    }
+
+    /// SPIR-V 1.3 without run-time checks: indices are in range by construction, gathers clamp theirs.
+    pub fn spirv(&self) -> Result<Vec<u32>, LowerError> {
+        use naga::back::spv;
+        let options = spv::Options {
+            lang_version: (1, 3),
+            flags: spv::WriterFlags::empty(),
+            zero_initialize_workgroup_memory: spv::ZeroInitializeWorkgroupMemoryMode::None,
+            force_loop_bounding: false,
+            emit_int_div_checks: false,
+            ..Default::default()
+        };
+        spv::write_vec(&self.module, &self.info, &options, None).map_err(|e| self.write_error(&e))
+    }
+
+    fn write_error(&self, e: &dyn std::fmt::Display) -> LowerError {
+        LowerError::Write { kernel: self.name.clone(), message: e.to_string() }
+    }
+}

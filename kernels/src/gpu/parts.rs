@@ -1,0 +1,420 @@
+//! A launch's region cut into parts, each what one kind of kernel does.
+//!
+//! Values that a part needs and another computes go through memory: through the buffer they are written to anyway, or
+//! through scratch memory. The order of parts is: sums over what the region reads, layers, other values written, sums
+//! over what was written. A value that replaces an input which a later part still reads is put aside and copied last.
+
+use super::elements::{self, closure};
+use super::layout::{Layout, Limits};
+use super::{Kernel, LowerError, layer, outer, reduce, scan, scatter};
+use raygrad_compiler::graph::{Axes, Shape};
+use raygrad_compiler::ops::Reduction;
+use raygrad_compiler::plan::Launch;
+use raygrad_compiler::plan::region::{BufferId, Inst, InstId, Region, RegionOp, Store};
+use raygrad_compiler::scalar::DType;
+use std::collections::HashMap;
+
+/// Most products of an `Outer` that single invocations accumulate.
+const SMALL_OUTER: usize = 64;
+/// Operations per element from which a value is written once rather than computed by two parts.
+const EXPENSIVE: usize = 200;
+
+enum Part {
+    Elements(Region),
+    Layer(Region, InstId),
+    Scan(Region),
+    Reduce(Region),
+    Outer(Region),
+    Scatter(Region),
+}
+
+impl Part {
+    fn region(&mut self) -> &mut Region {
+        match self {
+            Part::Elements(r)
+            | Part::Layer(r, _)
+            | Part::Scan(r)
+            | Part::Reduce(r)
+            | Part::Outer(r)
+            | Part::Scatter(r) => r,
+        }
+    }
+}
+
+/// Kernels of a launch, in order.
+pub(super) fn lower(layout: &mut Layout, limits: Limits, launch: &Launch) -> Result<Vec<Kernel>, LowerError> {
+    let mut split = Split { layout, region: launch.region.clone(), sums: vec![], writers: vec![], late: vec![] };
+    split.run()?;
+    let Split { sums, writers, late, .. } = split;
+    let mut parts: Vec<Part> = sums.into_iter().chain(writers).chain(late).collect();
+    put_aside(layout, &launch.region, &mut parts)?;
+    let several = parts.len() > 1;
+    let mut kernels = vec![];
+    for (i, part) in parts.into_iter().enumerate() {
+        let name = if several { format!("{}.{}", launch.name, part_name(&part, i)) } else { launch.name.clone() };
+        match part {
+            Part::Elements(r) => kernels.extend(elements::kernels(layout, limits, &name, &r)?),
+            Part::Layer(r, linear) => kernels.push(layer::kernel(layout, limits, &name, &r, linear)?),
+            Part::Scan(r) => kernels.push(scan::kernel(layout, limits, &name, &r)?),
+            Part::Reduce(r) => kernels.extend(reduce::kernels(layout, limits, &name, &r)?),
+            Part::Outer(r) => kernels.extend(outer::kernels(layout, limits, &name, &r)?),
+            Part::Scatter(r) => kernels.extend(scatter::kernels(layout, limits, &name, &r)?),
+        }
+    }
+    Ok(kernels)
+}
+
+fn part_name(part: &Part, i: usize) -> String {
+    let kind = match part {
+        Part::Elements(_) => "map",
+        Part::Layer(..) => "layer",
+        Part::Scan(_) => "scan",
+        Part::Reduce(_) => "reduce",
+        Part::Outer(_) => "outer",
+        Part::Scatter(_) => "scatter",
+    };
+    format!("{}_{kind}", i + 1)
+}
+
+struct Split<'l, 'a> {
+    layout: &'l mut Layout<'a>,
+    region: Region,
+    sums: Vec<Part>,
+    writers: Vec<Part>,
+    late: Vec<Part>,
+}
+
+impl Split<'_, '_> {
+    fn run(&mut self) -> Result<(), LowerError> {
+        let (writes, others): (Vec<Store>, Vec<Store>) =
+            self.region.stores.clone().into_iter().partition(|s| matches!(s, Store::Write { .. }));
+        self.region.stores = writes;
+        let homes = Homes::of(&self.region);
+        let mut on_lines = vec![];
+        let mut recomputed: Vec<Store> = vec![];
+        let mut reloaded: Vec<Store> = vec![];
+        for store in others {
+            if self.region.whole && self.is_along_lines(&store) {
+                on_lines.push(store);
+            } else if self.region.whole || self.must_reload(&store, &homes) {
+                reloaded.push(store);
+            } else {
+                recomputed.push(store);
+            }
+        }
+        self.combine(recomputed)?;
+        let mut late_region = empty(&self.region);
+        for store in reloaded {
+            let mut values = vec![];
+            for value in store.values() {
+                let buffer = self.materialize(value)?;
+                values.push((value, self.push_load(&mut late_region, buffer)));
+            }
+            let find = |v: InstId| values.iter().find(|x| x.0 == v).map_or(v, |x| x.1);
+            late_region.stores.push(store.map_values(find));
+        }
+        self.write(&homes, on_lines)?;
+        let late = std::mem::replace(&mut self.region, late_region);
+        let stores = std::mem::take(&mut self.region.stores);
+        let before = self.sums.len();
+        self.combine(stores)?;
+        self.late = self.sums.split_off(before);
+        self.region = late;
+        Ok(())
+    }
+
+    /// Reductions over exactly the axis that a scan's invocations run along.
+    fn is_along_lines(&self, store: &Store) -> bool {
+        let inner = Axes::new(self.region.inner.clone());
+        matches!(store, Store::Reduce { buffer, .. }
+            if self.layout.shape(*buffer).axes == self.region.domain.minus(&inner))
+    }
+
+    /// Whether a combined value is better read back than computed by the kernel that combines it.
+    fn must_reload(&self, store: &Store, homes: &Homes) -> bool {
+        let needed = closure(&self.region, store.values());
+        let layers = needed.iter().zip(&homes.level).any(|(n, l)| *n && l.is_some());
+        let written: Vec<InstId> = self.region.stores.iter().flat_map(|s| s.values()).collect();
+        let shared = closure(&self.region, written);
+        let cost: usize = (0..self.region.body.len())
+            .filter(|i| needed[*i] && shared[*i])
+            .map(|i| self.region.body[i].channels * elements::own_cost(&self.region, i))
+            .sum();
+        let channels: usize = store.values().iter().map(|v| self.region.inst(*v).channels).sum();
+        layers || cost > EXPENSIVE + 16 * channels
+    }
+
+    /// Parts for stores that combine values over axes, computed from the region's body.
+    fn combine(&mut self, stores: Vec<Store>) -> Result<(), LowerError> {
+        let mut reductions: Vec<(Axes, Region)> = vec![];
+        for store in stores {
+            let axes = self.layout.shape(store.buffer()).axes.clone();
+            let store = match store {
+                Store::Outer { x, d, buffer } if self.small_outer(x, d) => {
+                    let product = self.push_product(x, d);
+                    Store::Reduce { kind: Reduction::Sum, value: product, buffer }
+                }
+                other => other,
+            };
+            match &store {
+                Store::Reduce { .. } => match reductions.iter_mut().find(|r| r.0 == axes) {
+                    Some((_, region)) => region.stores.push(store),
+                    None => reductions.push((axes, Region { stores: vec![store], ..empty(&self.region) })),
+                },
+                Store::Outer { x, d, buffer } => {
+                    let mut loads = empty(&self.region);
+                    let (x, d) = (self.loaded(&mut loads, *x)?, self.loaded(&mut loads, *d)?);
+                    loads.stores = vec![Store::Outer { x, d, buffer: *buffer }];
+                    self.sums.push(Part::Outer(loads));
+                }
+                Store::Scatter { value, index, axis, buffer } => {
+                    // Every slot looks at every element: what it looks at should be a load.
+                    let mut loads = empty(&self.region);
+                    let (value, index) = (self.loaded(&mut loads, *value)?, self.loaded(&mut loads, *index)?);
+                    loads.stores = vec![Store::Scatter { value, index, axis: axis.clone(), buffer: *buffer }];
+                    self.sums.push(Part::Scatter(loads));
+                }
+                Store::Write { .. } => {}
+            }
+        }
+        for (_, mut region) in reductions {
+            region.body = self.region.body.clone();
+            self.sums.push(Part::Reduce(prune(region)));
+        }
+        Ok(())
+    }
+
+    fn small_outer(&self, x: InstId, d: InstId) -> bool {
+        self.region.inst(x).channels * self.region.inst(d).channels <= SMALL_OUTER
+    }
+
+    fn push_product(&mut self, x: InstId, d: InstId) -> InstId {
+        let channels = self.region.inst(x).channels * self.region.inst(d).channels;
+        let product = Inst {
+            op: RegionOp::RowOuter,
+            inputs: vec![x, d],
+            axes: self.region.domain.clone(),
+            channels,
+            label: "outer".into(),
+            ..self.region.inst(x).clone()
+        };
+        self.region.body.push(product);
+        InstId(self.region.body.len() as u32 - 1)
+    }
+
+    /// A value as a load in another region; written to scratch memory by a part of its own unless it is a load already.
+    fn loaded(&mut self, into: &mut Region, value: InstId) -> Result<InstId, LowerError> {
+        if let RegionOp::Load(_) = self.region.inst(value).op {
+            into.body.push(self.region.inst(value).clone());
+            return Ok(InstId(into.body.len() as u32 - 1));
+        }
+        let inst = self.region.inst(value);
+        let shape = Shape::of(self.region.domain.clone(), inst.channels, inst.dtype);
+        let buffer = self.layout.scratch(&inst.label.clone(), shape)?;
+        let stores = vec![Store::Write { value, buffer }];
+        self.sums.push(Part::Elements(prune(Region { stores, ..self.region.clone() })));
+        Ok(self.push_load(into, buffer))
+    }
+
+    /// The buffer that a value is written to: one of the region's own, or scratch memory.
+    fn materialize(&mut self, value: InstId) -> Result<BufferId, LowerError> {
+        if let RegionOp::Load(buffer) = self.region.inst(value).op {
+            return Ok(buffer);
+        }
+        let reads = self.region.reads();
+        let written = self.region.stores.iter().find(|s| s.values()[0] == value && !reads.contains(&s.buffer()));
+        if let Some(store) = written {
+            return Ok(store.buffer());
+        }
+        let inst = self.region.inst(value);
+        let shape = Shape::of(self.region.domain.clone(), inst.channels, inst.dtype);
+        let buffer = self.layout.scratch(&inst.label.clone(), shape)?;
+        self.region.stores.push(Store::Write { value, buffer });
+        Ok(buffer)
+    }
+
+    fn push_load(&self, region: &mut Region, buffer: BufferId) -> InstId {
+        push_load(self.layout, region, buffer)
+    }
+
+    /// Parts for values written element by element, and for reductions along a scan's lines.
+    fn write(&mut self, homes: &Homes, on_lines: Vec<Store>) -> Result<(), LowerError> {
+        if self.region.whole {
+            let mut region = self.region.clone();
+            region.stores.extend(on_lines);
+            if !region.stores.is_empty() {
+                self.writers.push(Part::Scan(prune(region)));
+            }
+            return Ok(());
+        }
+        // Values that cross from one layer's kernel to another part.
+        let mut cut: Vec<(InstId, BufferId)> = vec![];
+        for id in self.region.ids() {
+            if homes.cut.get(id.0 as usize).is_some_and(|c| *c) {
+                cut.push((id, self.materialize(id)?));
+            }
+        }
+        let stores = std::mem::take(&mut self.region.stores);
+        let home = |s: &Store| homes.home.get(s.values()[0].0 as usize).copied().flatten();
+        for (level, linear) in homes.layers.iter().enumerate() {
+            let own: Vec<Store> = stores.iter().filter(|s| home(s) == Some(level)).cloned().collect();
+            if own.is_empty() {
+                continue;
+            }
+            let mut region = Region { stores: own, ..self.region.clone() };
+            for (id, buffer) in cut.iter().filter(|c| homes.home[c.0.0 as usize] != Some(level)) {
+                replace_by_load(self.layout, &mut region, *id, *buffer);
+            }
+            let (region, renamed) = prune_with(region, *linear);
+            self.writers.push(Part::Layer(region, renamed));
+        }
+        let rest: Vec<Store> = stores.into_iter().filter(|s| home(s).is_none()).collect();
+        if !rest.is_empty() {
+            let mut region = Region { stores: rest, ..self.region.clone() };
+            for (id, buffer) in &cut {
+                replace_by_load(self.layout, &mut region, *id, *buffer);
+            }
+            self.writers.push(Part::Elements(prune(region)));
+        }
+        Ok(())
+    }
+}
+
+/// Which layer's kernel computes a value: a layer's epilogue is every pointwise value of the same channels after it.
+struct Homes {
+    /// The layers, in order.
+    layers: Vec<InstId>,
+    /// Per value, the layer in whose epilogue it is.
+    home: Vec<Option<usize>>,
+    /// The last layer it depends on.
+    level: Vec<Option<usize>>,
+    /// Whether it is needed outside the kernel that computes it.
+    cut: Vec<bool>,
+}
+
+impl Homes {
+    fn of(region: &Region) -> Homes {
+        let n = region.body.len();
+        let mut homes = Homes { layers: vec![], home: vec![None; n], level: vec![None; n], cut: vec![false; n] };
+        for id in region.ids() {
+            let (at, inst) = (id.0 as usize, region.inst(id));
+            let level = inst.inputs.iter().filter_map(|i| homes.level[i.0 as usize]).max();
+            homes.level[at] = level;
+            let x_in_memory = || matches!(region.inst(inst.inputs[0]).op, RegionOp::Load(_));
+            if matches!(inst.op, RegionOp::Linear(_)) && x_in_memory() {
+                homes.home[at] = Some(homes.layers.len());
+                homes.level[at] = homes.home[at];
+                homes.layers.push(id);
+                continue;
+            }
+            let aligned = |i: &InstId| {
+                matches!(inst.op, RegionOp::Map(_))
+                    && region.inst(*i).channels == inst.channels
+                    && homes.home[i.0 as usize] == level
+            };
+            if level.is_some() && inst.inputs.iter().any(aligned) {
+                homes.home[at] = level;
+            }
+            for i in &inst.inputs {
+                let i = i.0 as usize;
+                let elsewhere = homes.home[i].is_some() && homes.home[i] != homes.home[at];
+                // The epilogue works channel by channel: a narrower value of the same layer comes from memory.
+                let narrower = homes.home[i].is_some() && region.body[i].channels != inst.channels;
+                if elsewhere || narrower {
+                    homes.cut[i] = true;
+                }
+                if narrower && homes.home[at] == homes.home[i] {
+                    homes.home[at] = None;
+                }
+            }
+            if homes.home[at].is_none() {
+                inst.inputs.iter().filter(|i| homes.home[i.0 as usize].is_some()).for_each(|i| {
+                    homes.cut[i.0 as usize] = true;
+                });
+            }
+        }
+        homes
+    }
+}
+
+/// Redirects writes that replace a buffer which a later part, or another invocation of the same part, still reads.
+fn put_aside(layout: &mut Layout, original: &Region, parts: &mut Vec<Part>) -> Result<(), LowerError> {
+    let replaced: Vec<BufferId> = {
+        let reads = original.reads();
+        original.stores.iter().map(Store::buffer).filter(|b| reads.contains(b)).collect()
+    };
+    let mut copies = vec![];
+    for buffer in replaced {
+        let writes = |p: &mut Part| p.region().stores.iter().any(|s| s.buffer() == buffer);
+        let Some(writer) = parts.iter_mut().position(writes) else { continue };
+        let later = parts[writer + 1..].iter_mut().any(|p| p.region().reads().contains(&buffer));
+        if !later && matches!(parts[writer], Part::Elements(_)) {
+            continue;
+        }
+        let aside = layout.scratch("aside", layout.shape(buffer).clone())?;
+        for store in &mut parts[writer].region().stores {
+            if let Store::Write { buffer: b, .. } = store
+                && *b == buffer
+            {
+                *b = aside;
+            }
+        }
+        let mut copy = Region { domain: layout.shape(buffer).axes.clone(), ..empty(original) };
+        let value = push_load(layout, &mut copy, aside);
+        copy.stores.push(Store::Write { value, buffer });
+        copies.push(Part::Elements(copy));
+    }
+    parts.extend(copies);
+    Ok(())
+}
+
+/// The same loop without contents.
+fn empty(region: &Region) -> Region {
+    Region { body: vec![], stores: vec![], whole: false, ..region.clone() }
+}
+
+fn push_load(layout: &Layout, region: &mut Region, buffer: BufferId) -> InstId {
+    let shape = layout.shape(buffer);
+    region.body.push(Inst {
+        op: RegionOp::Load(buffer),
+        inputs: vec![],
+        axes: shape.axes.clone(),
+        channels: shape.channels.count(),
+        dtype: shape.dtype,
+        label: layout.name(buffer).into(),
+        source: std::panic::Location::caller(),
+    });
+    InstId(region.body.len() as u32 - 1)
+}
+
+fn replace_by_load(layout: &Layout, region: &mut Region, id: InstId, buffer: BufferId) {
+    let axes = layout.shape(buffer).axes.clone();
+    let inst = &mut region.body[id.0 as usize];
+    debug_assert!(inst.dtype == DType::F32 || layout.shape(buffer).dtype == inst.dtype);
+    *inst = Inst { op: RegionOp::Load(buffer), inputs: vec![], axes, ..inst.clone() };
+}
+
+/// Drops what no store needs.
+fn prune(region: Region) -> Region {
+    let needed = closure(&region, region.stores.iter().flat_map(|s| s.values()));
+    prune_to(region, &needed).0
+}
+
+/// Likewise; also tells the new id of a value that is needed.
+fn prune_with(region: Region, id: InstId) -> (Region, InstId) {
+    let needed = closure(&region, region.stores.iter().flat_map(|s| s.values()));
+    let (region, renamed) = prune_to(region, &needed);
+    (region, renamed[&id])
+}
+
+fn prune_to(region: Region, needed: &[bool]) -> (Region, HashMap<InstId, InstId>) {
+    let mut renamed = HashMap::new();
+    let mut body = vec![];
+    for (at, inst) in region.body.iter().enumerate().filter(|(at, _)| needed[*at]) {
+        renamed.insert(InstId(at as u32), InstId(body.len() as u32));
+        let inputs = inst.inputs.iter().map(|i| renamed[i]).collect();
+        body.push(Inst { inputs, ..inst.clone() });
+    }
+    let stores = region.stores.iter().map(|s| s.map_values(|v| renamed[&v])).collect();
+    (Region { body, stores, ..region }, renamed)
+}

@@ -1,0 +1,348 @@
+//! Sums and maxima over axes, in a fixed order, without atomics.
+//!
+//! Few rows: an invocation a result runs over them. Many rows: a workgroup takes a chunk of them, its invocations every
+//! 64th row each, and combines through workgroup memory; a second kernel combines the chunks.
+
+use super::builder::{Builder, Kind, Value, Var};
+use super::channels::is_indexable;
+use super::eval::{Channel, Values};
+use super::layout::{Layout, Limits};
+use super::memory::{Emit, Position, WORKGROUP};
+use super::{Kernel, LowerError};
+use raygrad_compiler::graph::{Axes, Shape};
+use raygrad_compiler::ops::Reduction;
+use raygrad_compiler::plan::region::{BufferId, Region, Store};
+use raygrad_compiler::scalar::DType;
+
+/// Most channels that one invocation accumulates.
+const MAX_CHANNELS: usize = 64;
+/// Rows up to which one invocation sums alone.
+const FEW_ROWS: usize = 64;
+/// Results from which invocations that sum alone fill a device.
+const MANY_RESULTS: usize = 16384;
+/// Rows of a chunk, at least.
+const CHUNK_ROWS: usize = 1024;
+/// Chunks, at most.
+pub(super) const MAX_CHUNKS: usize = 256;
+
+/// Combines two values.
+pub(super) fn combine(b: &mut Builder, kind: Reduction, so_far: Value, next: Value) -> Value {
+    match kind {
+        Reduction::Sum => b.add(so_far, next),
+        Reduction::Max => {
+            let above = b.less(so_far, next);
+            b.select(above, next, so_far)
+        }
+    }
+}
+
+/// What combining starts from.
+pub(super) fn neutral(b: &mut Builder, kind: Reduction) -> Value {
+    match kind {
+        Reduction::Sum => b.f(0.0),
+        Reduction::Max => b.f(f32::MIN),
+    }
+}
+
+/// A result of the kernel: a channel of a store's buffer, or with `lanes`, all of them.
+struct Target {
+    store: usize,
+    kind: Reduction,
+    channel: u32,
+}
+
+/// Kernels for a region whose stores all reduce to buffers of the same axes.
+pub(super) fn kernels(
+    layout: &mut Layout,
+    limits: Limits,
+    name: &str,
+    region: &Region,
+) -> Result<Vec<Kernel>, LowerError> {
+    // By lane where channels are many: channels are then a dimension of the dispatch.
+    let mut narrow: Vec<Target> = vec![];
+    let mut groups: Vec<(bool, Vec<Target>)> = vec![];
+    for (store, s) in region.stores.iter().enumerate() {
+        let Store::Reduce { kind, value, .. } = s else { continue };
+        let channels = region.inst(*value).channels;
+        if channels > MAX_CHANNELS && is_indexable(region, *value) {
+            groups.push((true, vec![Target { store, kind: *kind, channel: 0 }]));
+        } else {
+            narrow.extend((0..channels as u32).map(|channel| Target { store, kind: *kind, channel }));
+        }
+    }
+    while !narrow.is_empty() {
+        let rest = narrow.split_off(narrow.len().min(MAX_CHANNELS));
+        groups.push((false, std::mem::replace(&mut narrow, rest)));
+    }
+    let several = groups.len() > 1;
+    let mut all = vec![];
+    for (i, (by_lane, targets)) in groups.iter().enumerate() {
+        let name = if several { format!("{name}.{}", i + 1) } else { name.to_string() };
+        all.extend(group(layout, limits, &name, region, targets, *by_lane)?);
+    }
+    Ok(all)
+}
+
+fn group(
+    layout: &mut Layout,
+    limits: Limits,
+    name: &str,
+    region: &Region,
+    targets: &[Target],
+    by_lane: bool,
+) -> Result<Vec<Kernel>, LowerError> {
+    let keep = layout.shape(region.stores[targets[0].store].buffer()).axes.clone();
+    let over = region.domain.minus(&keep);
+    let (kept, rows) = (keep.elements(), over.elements());
+    let channels = if by_lane { region.inst(region.stores[targets[0].store].values()[0]).channels } else { 1 };
+    let results = kept * channels;
+    let work = Reducer { region, targets, by_lane, keep, over, channels };
+    if rows <= FEW_ROWS || results >= MANY_RESULTS && rows < 32768 {
+        return Ok(vec![work.alone(layout, limits, name)?]);
+    }
+    let chunks = rows.div_ceil(CHUNK_ROWS).min(MAX_CHUNKS.min((MANY_RESULTS * 16).div_ceil(results)).max(1));
+    let per_chunk = rows.div_ceil(chunks).next_multiple_of(WORKGROUP as usize);
+    let chunks = rows.div_ceil(per_chunk);
+    if chunks == 1 {
+        return Ok(vec![work.chunked(layout, limits, name, per_chunk, 1, None)?]);
+    }
+    let lanes = chunks * results * targets.len();
+    let partials = layout.scratch("partial", Shape::of(Axes::none(), lanes, DType::F32))?;
+    let first = work.chunked(layout, limits, name, per_chunk, chunks, Some(partials))?;
+    let mut ends = vec![];
+    for t in targets {
+        let first = if by_lane { 0 } else { t.channel as usize * kept };
+        ends.push(End { buffer: region.stores[t.store].buffer(), first, lanes: results, kind: t.kind });
+    }
+    let last = finish(layout, limits, &format!("{name}.finish"), partials, chunks, &ends)?;
+    Ok(vec![first, last])
+}
+
+struct Reducer<'r> {
+    region: &'r Region,
+    targets: &'r [Target],
+    by_lane: bool,
+    keep: Axes,
+    over: Axes,
+    /// Channels that are a dimension of the dispatch.
+    channels: usize,
+}
+
+impl Reducer<'_> {
+    fn start(&self, e: &mut Emit) -> Vec<Var> {
+        let mut all = vec![];
+        for t in self.targets {
+            let first = neutral(&mut e.b, t.kind);
+            all.push(e.b.var("total", first));
+        }
+        all
+    }
+
+    /// Adds the values at one row.
+    fn step(&self, e: &mut Emit, totals: &[Var], kept: Value, channel: Value, row: Value) {
+        let position = Position::new(&self.keep, kept).and(&self.over, row);
+        let mut values = Values::new(self.region, vec![position]);
+        for (t, total) in self.targets.iter().zip(totals) {
+            let id = self.region.stores[t.store].values()[0];
+            let c = if self.by_lane { Channel::Var(channel) } else { Channel::At(t.channel) };
+            let next = values.channel(e, id, c);
+            let so_far = e.b.get(*total);
+            let next = combine(&mut e.b, t.kind, so_far, next);
+            e.b.set(*total, next);
+        }
+    }
+
+    fn buffer(&self, t: &Target) -> BufferId {
+        self.region.stores[t.store].buffer()
+    }
+
+    /// Lane of a target's result.
+    fn index(&self, e: &mut Emit, t: &Target, kept: Value, channel: Value) -> Value {
+        let channel = if self.by_lane { channel } else { e.b.u(t.channel) };
+        e.index(self.buffer(t), channel, kept)
+    }
+
+    /// An invocation a result.
+    fn alone(&self, layout: &Layout, limits: Limits, name: &str) -> Result<Kernel, LowerError> {
+        let kept_elements = self.keep.elements() as u32;
+        let (mut e, number) = Emit::over(layout, limits, kept_elements as u64 * self.channels as u64)?;
+        let per_channel = e.b.u(kept_elements);
+        let (channel, kept) = (e.b.div(number, per_channel), e.b.rem(number, per_channel));
+        let totals = self.start(&mut e);
+        let (from, to) = (e.b.u(0), e.b.u(self.over.elements() as u32));
+        let row = e.b.open_loop("row", from, to, 1);
+        self.step(&mut e, &totals, kept, channel, row);
+        e.b.close_loop();
+        for (t, total) in self.targets.iter().zip(&totals) {
+            let value = e.b.get(*total);
+            let at = self.index(&mut e, t, kept, channel);
+            e.store(self.buffer(t), at, value);
+        }
+        e.finish(name)
+    }
+
+    /// A workgroup a chunk of rows. Results go to `partials`, chunk by chunk and target by target, or to the buffers.
+    fn chunked(
+        &self,
+        layout: &Layout,
+        limits: Limits,
+        name: &str,
+        per_chunk: usize,
+        chunks: usize,
+        partials: Option<BufferId>,
+    ) -> Result<Kernel, LowerError> {
+        let (kept_elements, rows) = (self.keep.elements(), self.over.elements());
+        let results = kept_elements * self.channels;
+        let mut e = Emit::new(layout, limits, (chunks * results) as u64, WORKGROUP)?;
+        if e.spare_workgroups() {
+            e.leave_from(e.workgroup, (chunks * results) as u32);
+        }
+        let (results_value, per_channel) = (e.b.u(results as u32), e.b.u(kept_elements as u32));
+        let (chunk, result) = (e.b.div(e.workgroup, results_value), e.b.rem(e.workgroup, results_value));
+        let (channel, kept) = (e.b.div(result, per_channel), e.b.rem(result, per_channel));
+        let totals = self.start(&mut e);
+        let length = e.b.u(per_chunk as u32);
+        let first = e.b.mul(chunk, length);
+        let end = e.b.add(first, length);
+        let all = e.b.u(rows as u32);
+        let end = if rows.is_multiple_of(per_chunk) { end } else { e.b.math(naga::MathFunction::Min, &[end, all]) };
+        let own = e.b.add(first, e.invocation);
+        let row = e.b.open_loop("row", own, end, WORKGROUP);
+        self.step(&mut e, &totals, kept, channel, row);
+        e.b.close_loop();
+
+        // One invocation a target sums what the workgroup's 64 found.
+        let count = self.targets.len() as u32;
+        let found = e.b.workgroup("found", Kind::F32, false, count * WORKGROUP);
+        for (i, total) in totals.iter().enumerate() {
+            let value = e.b.get(*total);
+            let first = e.b.u(i as u32 * WORKGROUP);
+            let at = e.b.add(e.invocation, first);
+            e.b.store(found, at, value);
+        }
+        e.b.barrier();
+        let kinds: Vec<Reduction> = self.targets.iter().map(|t| t.kind).collect();
+        let uniform = kinds.iter().all(|k| *k == kinds[0]);
+        let combined = |e: &mut Emit, first: Value, kind: Reduction| {
+            let start = neutral(&mut e.b, kind);
+            let total = e.b.var("all", start);
+            let (from, to) = (e.b.u(0), e.b.u(WORKGROUP));
+            let i = e.b.open_loop("other", from, to, 4);
+            for j in 0..4 {
+                let offset = e.b.u(j);
+                let at = e.b.add(i, offset);
+                let at = e.b.add(at, first);
+                let next = e.b.load(found, at);
+                let so_far = e.b.get(total);
+                let next = combine(&mut e.b, kind, so_far, next);
+                e.b.set(total, next);
+            }
+            e.b.close_loop();
+            e.b.get(total)
+        };
+        if let (Some(partials), true) = (partials, uniform) {
+            let limit = e.b.u(count);
+            let mine = e.b.less(e.invocation, limit);
+            e.b.open_if(mine);
+            let size = e.b.u(WORKGROUP);
+            let first = e.b.mul(e.invocation, size);
+            let total = combined(&mut e, first, kinds[0]);
+            let block = e.b.mul(chunk, limit);
+            let block = e.b.add(block, e.invocation);
+            let block = e.b.mul(block, results_value);
+            let at = e.b.add(block, result);
+            e.store(partials, at, total);
+            e.b.close_if();
+            return e.finish(name);
+        }
+        for (i, t) in self.targets.iter().enumerate() {
+            let own = e.b.u(i as u32);
+            let mine = e.b.binary(naga::BinaryOperator::Equal, e.invocation, own);
+            e.b.open_if(mine);
+            let first = e.b.u(i as u32 * WORKGROUP);
+            let total = combined(&mut e, first, t.kind);
+            match partials {
+                Some(partials) => {
+                    let (count, own) = (e.b.u(count), e.b.u(i as u32));
+                    let block = e.b.mul(chunk, count);
+                    let block = e.b.add(block, own);
+                    let block = e.b.mul(block, results_value);
+                    let at = e.b.add(block, result);
+                    e.store(partials, at, total);
+                }
+                None => {
+                    let at = self.index(&mut e, t, kept, channel);
+                    e.store(self.buffer(t), at, total);
+                }
+            }
+            e.b.close_if();
+        }
+        e.finish(name)
+    }
+}
+
+/// Lanes `first..first + lanes` of a buffer, as one stretch of a chunk's partial results.
+pub(super) struct End {
+    pub buffer: BufferId,
+    pub first: usize,
+    pub lanes: usize,
+    pub kind: Reduction,
+}
+
+/// Combines chunks: partial results lie chunk by chunk, each chunk with the stretches `ends` one after another.
+pub(super) fn finish(
+    layout: &Layout,
+    limits: Limits,
+    name: &str,
+    partials: BufferId,
+    chunks: usize,
+    ends: &[End],
+) -> Result<Kernel, LowerError> {
+    let per_chunk: usize = ends.iter().map(|x| x.lanes).sum();
+    // Neighbouring stretches of one buffer are one.
+    let mut merged: Vec<End> = vec![];
+    for end in ends {
+        match merged.last_mut() {
+            Some(m) if m.buffer == end.buffer && m.first + m.lanes == end.first && m.kind == end.kind => {
+                m.lanes += end.lanes
+            }
+            _ => merged.push(End { ..*end }),
+        }
+    }
+    let (mut e, number) = Emit::over(layout, limits, per_chunk as u64)?;
+    let sum = |e: &mut Emit, kind: Reduction| {
+        let start = neutral(&mut e.b, kind);
+        let total = e.b.var("total", start);
+        let (from, to) = (e.b.u(0), e.b.u(chunks as u32));
+        let chunk = e.b.open_loop("chunk", from, to, 1);
+        let stride = e.b.u(per_chunk as u32);
+        let at = e.b.mul(chunk, stride);
+        let at = e.b.add(at, number);
+        let next = e.load(partials, at);
+        let so_far = e.b.get(total);
+        let next = combine(&mut e.b, kind, so_far, next);
+        e.b.set(total, next);
+        e.b.close_loop();
+        e.b.get(total)
+    };
+    let mut from = 0;
+    for (i, end) in merged.iter().enumerate() {
+        let last = i + 1 == merged.len();
+        if !last {
+            let to = e.b.u((from + end.lanes) as u32);
+            let here = e.b.less(number, to);
+            e.b.open_if(here);
+        }
+        let total = sum(&mut e, end.kind);
+        let (before, first) = (e.b.u(from as u32), e.b.u(end.first as u32));
+        let at = e.b.sub(number, before);
+        let at = e.b.add(at, first);
+        e.store(end.buffer, at, total);
+        if !last {
+            e.b.open_else();
+        }
+        from += end.lanes;
+    }
+    (1..merged.len()).for_each(|_| e.b.close_if());
+    e.finish(name)
+}

@@ -1,0 +1,230 @@
+//! Scalar programs as naga expressions, on scalars or on vectors of four.
+//!
+//! Where a device's function is only loosely specified, it is built from others: Vulkan promises nothing for `sin`
+//! outside `[-pi, pi]`, 4096 ulp for `atan2`, and no digits for `tanh` near 0.
+
+use super::builder::{Builder, Kind, Value};
+use naga::{BinaryOperator as Op, MathFunction as Math, UnaryOperator};
+use raygrad_compiler::scalar::{Prim, ScalarProgram, Val};
+use std::f32::consts;
+
+/// `(tanh(x) / x - 1) / x^2` in `x^2`, for `|x| <= 0.63`; the CPU kernels use the same.
+const TANH: [f32; 5] = [-0.333_332_78, 0.133_313_2, -0.053_729_13, 0.020_603_238, -0.005_663_615];
+/// `(atan(t) / t - 1) / t^2` in `t^2`, for `|t| <= 1`.
+const ATAN: [f32; 8] = [
+    -0.333_331_53,
+    0.199_937_69,
+    -0.142_110_24,
+    0.106_658_93,
+    -0.075_519_934,
+    0.043_209_426,
+    -0.016_366_52,
+    0.002_920_359_8,
+];
+
+/// Emits `program` on `inputs`; the result has the type `kind`.
+pub(super) fn emit(b: &mut Builder, program: &ScalarProgram, inputs: &[Value], kind: Kind) -> Value {
+    let kinds = kinds(program, inputs, kind);
+    let mut values: Vec<Value> = Vec::with_capacity(program.code.len());
+    for (at, (prim, args)) in program.code.iter().enumerate() {
+        let wanted = operand_kinds(*prim, kinds[at]);
+        let args: Vec<Value> = args
+            .iter()
+            .zip(wanted)
+            .map(|(arg, want)| match arg {
+                Val::Input(i) => inputs[*i as usize],
+                Val::Inst(i) => values[*i as usize],
+                Val::Const(bits) => b.literal(if want == Kind::Bool { Kind::U32 } else { want }, *bits),
+            })
+            .collect();
+        let value = primitive(b, *prim, &args);
+        values.push(value);
+    }
+    match values.last() {
+        Some(last) if kind == Kind::U32 => integer(b, *last),
+        Some(last) => *last,
+        None => inputs[0],
+    }
+}
+
+/// Result types. Only a `Select` between constants does not tell; then its user does.
+fn kinds(program: &ScalarProgram, inputs: &[Value], last: Kind) -> Vec<Kind> {
+    let mut kinds: Vec<Option<Kind>> = vec![];
+    for (prim, args) in &program.code {
+        let known = match prim {
+            Prim::Select => args[1..].iter().find_map(|a| match a {
+                Val::Input(i) => Some(inputs[*i as usize].kind),
+                Val::Inst(i) => kinds[*i as usize],
+                Val::Const(_) => None,
+            }),
+            other => Some(other.result(raygrad_compiler::scalar::DType::F32).into()),
+        };
+        kinds.push(known);
+    }
+    for at in (0..kinds.len()).rev() {
+        let own = *kinds[at].get_or_insert(last);
+        let (prim, args) = &program.code[at];
+        for (arg, want) in args.iter().zip(operand_kinds(*prim, own)) {
+            if let Val::Inst(i) = arg {
+                kinds[*i as usize].get_or_insert(if want == Kind::Bool { Kind::U32 } else { want });
+            }
+        }
+    }
+    kinds.into_iter().map(|k| k.unwrap_or(last)).collect()
+}
+
+/// Types of the operands; `Bool` is a truth value as a bool or an integer.
+fn operand_kinds(prim: Prim, result: Kind) -> [Kind; 3] {
+    use Prim::*;
+    match prim {
+        UAdd | UMul | UAnd | UOr | UXor | UShl | UShr | ULt | UEq | ToF32 => [Kind::U32; 3],
+        Select => [Kind::Bool, result, result],
+        _ => [Kind::F32; 3],
+    }
+}
+
+/// A truth value as 0 or 1.
+fn integer(b: &mut Builder, v: Value) -> Value {
+    if v.kind != Kind::Bool {
+        return v;
+    }
+    let (one, zero) = (b.u(1), b.u(0));
+    b.select(v, one, zero)
+}
+
+fn truth(b: &mut Builder, v: Value) -> Value {
+    if v.kind == Kind::Bool {
+        return v;
+    }
+    let zero = b.u(0);
+    b.binary(Op::NotEqual, v, zero)
+}
+
+fn primitive(b: &mut Builder, prim: Prim, args: &[Value]) -> Value {
+    use Prim::*;
+    let whole = matches!(operand_kinds(prim, Kind::F32)[0], Kind::U32);
+    let args: Vec<Value> = args.iter().map(|a| if whole { integer(b, *a) } else { *a }).collect();
+    let two = |b: &mut Builder, op| b.binary(op, args[0], args[1]);
+    match prim {
+        Neg => b.unary(UnaryOperator::Negate, args[0]),
+        Abs => b.math(Math::Abs, &args),
+        Floor => b.math(Math::Floor, &args),
+        Exp => b.math(Math::Exp, &args),
+        Log => b.math(Math::Log, &args),
+        Sqrt => b.math(Math::Sqrt, &args),
+        Sin => periodic(b, Math::Sin, args[0]),
+        Cos => periodic(b, Math::Cos, args[0]),
+        Tanh => tanh(b, args[0]),
+        Add | UAdd => two(b, Op::Add),
+        Sub => two(b, Op::Subtract),
+        Mul | UMul => two(b, Op::Multiply),
+        Div => two(b, Op::Divide),
+        Min => {
+            let below = two(b, Op::Less);
+            b.select(below, args[0], args[1])
+        }
+        Max => {
+            let above = two(b, Op::Greater);
+            b.select(above, args[0], args[1])
+        }
+        Atan2 => atan2(b, args[0], args[1]),
+        Lt | ULt => two(b, Op::Less),
+        Le => two(b, Op::LessEqual),
+        Eq | UEq => two(b, Op::Equal),
+        Select => {
+            let condition = truth(b, args[0]);
+            let (accept, reject) = (integer(b, args[1]), integer(b, args[2]));
+            b.select(condition, accept, reject)
+        }
+        UAnd => two(b, Op::And),
+        UOr => two(b, Op::InclusiveOr),
+        UXor => two(b, Op::ExclusiveOr),
+        UShl | UShr => {
+            let mask = b.u(31);
+            let amount = b.and(args[1], mask);
+            b.binary(if prim == UShl { Op::ShiftLeft } else { Op::ShiftRight }, args[0], amount)
+        }
+        ToF32 => b.convert(args[0], Kind::F32),
+        ToU32 => to_u32(b, args[0]),
+    }
+}
+
+/// `sin` or `cos` of an angle brought into `[-pi, pi]`, exactly where the angle is a power of two times pi.
+fn periodic(b: &mut Builder, fun: Math, x: Value) -> Value {
+    let per_turn = b.f(1.0 / consts::TAU);
+    let turns = b.mul(x, per_turn);
+    let whole = b.math(Math::Round, &[turns]);
+    // x - whole * 2 pi, with 2 pi in three parts, so that large angles keep their digits.
+    let (high, middle, low) = (b.f(-6.281_25), b.f(-1.935_005_2e-3), b.f(-3.019_916e-7));
+    let rest = b.fma(whole, high, x);
+    let rest = b.fma(whole, middle, rest);
+    let rest = b.fma(whole, low, rest);
+    b.math(fun, &[rest])
+}
+
+fn polynomial(b: &mut Builder, x: Value, coefficients: &[f32]) -> Value {
+    let mut sum = b.f(coefficients[coefficients.len() - 1]);
+    for c in coefficients.iter().rev().skip(1) {
+        let c = b.f(*c);
+        sum = b.fma(sum, x, c);
+    }
+    sum
+}
+
+/// A polynomial near 0, else `1 - 2 / (exp(2 |x|) + 1)` with the sign of x.
+fn tanh(b: &mut Builder, x: Value) -> Value {
+    let (zero, one, two, ten, near) = (b.f(0.0), b.f(1.0), b.f(2.0), b.f(10.0), b.f(0.625));
+    let size = b.math(Math::Abs, &[x]);
+    let size = b.math(Math::Min, &[size, ten]);
+    let square = b.mul(size, size);
+    let series = polynomial(b, square, &TANH);
+    let series = b.mul(series, square);
+    let inner = b.fma(series, size, size);
+    let twice = b.mul(two, size);
+    let grown = b.math(Math::Exp, &[twice]);
+    let below = b.add(grown, one);
+    let part = b.div(two, below);
+    let outer = b.sub(one, part);
+    let is_near = b.less(size, near);
+    let result = b.select(is_near, inner, outer);
+    let minus = b.unary(UnaryOperator::Negate, result);
+    let negative = b.less(x, zero);
+    b.select(negative, minus, result)
+}
+
+/// The angle of the point `(x, y)`, 0 for the origin.
+fn atan2(b: &mut Builder, y: Value, x: Value) -> Value {
+    let (zero, tiny) = (b.f(0.0), b.f(f32::MIN_POSITIVE));
+    let (ax, ay) = (b.math(Math::Abs, &[x]), b.math(Math::Abs, &[y]));
+    let steep = b.less(ax, ay);
+    let smaller = b.select(steep, ax, ay);
+    let larger = b.select(steep, ay, ax);
+    let larger = b.math(Math::Max, &[larger, tiny]);
+    let t = b.div(smaller, larger);
+    let square = b.mul(t, t);
+    let series = polynomial(b, square, &ATAN);
+    let series = b.mul(series, square);
+    let r = b.fma(series, t, t);
+    let quarter = b.f(consts::FRAC_PI_2);
+    let turned = b.sub(quarter, r);
+    let r = b.select(steep, turned, r);
+    let half = b.f(consts::PI);
+    let opposite = b.sub(half, r);
+    let left = b.less(x, zero);
+    let r = b.select(left, opposite, r);
+    let minus = b.unary(UnaryOperator::Negate, r);
+    let below = b.less(y, zero);
+    b.select(below, minus, r)
+}
+
+/// Truncates towards zero and saturates; NaN gives 0.
+fn to_u32(b: &mut Builder, x: Value) -> Value {
+    let (zero, past, largest) = (b.f(0.0), b.f(4_294_967_296.0), b.f(4_294_967_040.0));
+    let positive = b.less(zero, x);
+    let x = b.select(positive, x, zero);
+    let fits = b.less(x, past);
+    let inside = b.select(fits, x, largest);
+    let whole = b.convert(inside, Kind::U32);
+    let full = b.u(u32::MAX);
+    b.select(fits, whole, full)
+}

@@ -1,0 +1,110 @@
+//! `raygrad explain`: what an experiment compiles to. Needs no device.
+
+use crate::{Choice, output_folder};
+use clap::{Args, ValueEnum};
+use raygrad::planar::{PlanarData, PlanarModel};
+use raygrad::run::files::write_atomically;
+use raygrad::warps;
+use raygrad_compiler::graph::topological;
+use raygrad_compiler::{Program, Step, Target, compile};
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+#[derive(Args)]
+pub struct ExplainArgs {
+    #[command(flatten)]
+    choice: Choice,
+    /// Print or write an artefact instead of the explanation.
+    #[arg(long, value_enum)]
+    emit: Option<Artefact>,
+    /// Folder for the artefacts, a file a kernel; without it they are printed.
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Which kind of device to plan for.
+    #[arg(long, value_enum, default_value = "cpu")]
+    target: TargetChoice,
+    /// Print how long each stage takes.
+    #[arg(long)]
+    timing: bool,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Artefact {
+    /// The recorded ops, forward, backward and optimiser.
+    Graph,
+    /// The launches with every instruction.
+    Plan,
+    /// The GPU kernels as WGSL.
+    Wgsl,
+    /// The GPU kernels as SPIR-V.
+    Spirv,
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum TargetChoice {
+    Cpu,
+    Gpu,
+}
+
+pub fn run(args: &ExplainArgs) -> anyhow::Result<ExitCode> {
+    let experiment = args.choice.experiment()?;
+    experiment.layered.validate().map_err(raygrad::Error::from)?;
+    let settings = &experiment.layered.settings;
+    let data = PlanarData::load(&experiment.layered).map_err(raygrad::Error::from)?;
+    let begun = Instant::now();
+    let step = PlanarModel::new(settings, data.grid, warps::of_settings(settings)).train_step();
+    let recorded = begun.elapsed();
+    let gpu = args.target == TargetChoice::Gpu || matches!(args.emit, Some(Artefact::Wgsl | Artefact::Spirv));
+    let target = if gpu { Target::gpu() } else { Target::cpu() };
+    let program = compile(&step, &target).map_err(raygrad::Error::from)?;
+    let files = match args.emit {
+        None => vec![("explain.txt".to_string(), program.to_string().into_bytes())],
+        Some(Artefact::Graph) => vec![("graph.txt".to_string(), graph(&step).into_bytes())],
+        Some(Artefact::Plan) => vec![("plan.txt".to_string(), format!("{program:#?}\n").into_bytes())],
+        Some(Artefact::Wgsl | Artefact::Spirv) => anyhow::bail!("this build has no GPU kernels"),
+    };
+    match &args.out {
+        Some(folder) => {
+            output_folder(folder)?;
+            for (name, bytes) in &files {
+                write_atomically(&folder.join(name), bytes).map_err(raygrad::Error::from)?;
+            }
+            println!("{} files in {}", files.len(), folder.display());
+        }
+        None => {
+            for (name, bytes) in &files {
+                if files.len() > 1 {
+                    println!("// {name}");
+                }
+                print!("{}", String::from_utf8_lossy(bytes));
+            }
+        }
+    }
+    if args.timing {
+        timing(recorded, &program);
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// One line an op, operands before users.
+fn graph(step: &Step) -> String {
+    let mut text: String = topological(step.roots()).iter().map(|t| format!("{t:?}  // {}\n", t.source())).collect();
+    for (name, tensor) in &step.outputs {
+        text += &format!("output {name} = %{}\n", tensor.id());
+    }
+    for (input, value) in &step.updates {
+        text += &format!("update {} = %{}\n", input.input_name().unwrap_or_default(), value.id());
+    }
+    text
+}
+
+fn timing(recorded: Duration, program: &Program) {
+    let t = &program.timing;
+    let stages = [("record, differentiate", recorded), ("simplify", t.simplify), ("fuse", t.fuse), ("plan", t.plan)];
+    for (stage, time) in stages {
+        println!("{stage:<22} {:8.2} ms", 1e3 * time.as_secs_f64());
+    }
+    let total: Duration = stages.iter().map(|s| s.1).sum();
+    println!("{:<22} {:8.2} ms", "total", 1e3 * total.as_secs_f64());
+}

@@ -1,0 +1,98 @@
+//! Progress of a run on standard error: a bar on a terminal, plain lines elsewhere.
+
+use indicatif::{ProgressBar, ProgressStyle};
+use raygrad::Observer;
+use raygrad::report::duration;
+use raygrad::run::Entry;
+use std::io::IsTerminal;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+/// Plain lines are at least this far apart.
+const QUIET: Duration = Duration::from_secs(2);
+
+pub struct Progress {
+    bar: Option<ProgressBar>,
+    begun: Instant,
+    last_line: Option<Instant>,
+    first: usize,
+    done: usize,
+    steps: usize,
+}
+
+impl Progress {
+    pub fn new() -> Progress {
+        let bar = std::io::stderr().is_terminal().then(ProgressBar::no_length);
+        Progress { bar, begun: Instant::now(), last_line: None, first: 0, done: 0, steps: 0 }
+    }
+
+    /// Steps a second in this part of the run.
+    fn rate(&self) -> f64 {
+        (self.done - self.first) as f64 / self.begun.elapsed().as_secs_f64().max(1e-3)
+    }
+
+    fn state(entry: &Entry) -> String {
+        let total = entry.loss.get("total").copied().unwrap_or(0.0);
+        let (psnr, corner) = (entry.patch_psnr_db, entry.corner_error_px.mean);
+        format!("loss {total:.5}  PSNR {psnr:.2} dB  corners {corner:.2} px")
+    }
+}
+
+impl Observer for Progress {
+    fn begin(&mut self, folder: &Path, done: usize, steps: usize) {
+        (self.begun, self.first, self.done, self.steps) = (Instant::now(), done, done, steps);
+        match &self.bar {
+            Some(bar) => {
+                let template = "{bar:32.cyan/blue} {pos}/{len}  {per_sec}  ETA {eta}  {msg}";
+                if let Ok(style) = ProgressStyle::with_template(template) {
+                    bar.set_style(style);
+                }
+                bar.set_length(steps as u64);
+                bar.set_position(done as u64);
+                bar.reset_eta();
+                bar.println(format!("training into {}", folder.display()));
+            }
+            None => eprintln!("training into {}, step {done} of {steps}", folder.display()),
+        }
+    }
+
+    fn step(&mut self, done: usize) {
+        self.done = done;
+        if let Some(bar) = &self.bar {
+            bar.set_position(done as u64);
+        }
+    }
+
+    fn measured(&mut self, entry: &Entry) {
+        self.done = entry.step;
+        match &self.bar {
+            Some(bar) => bar.set_message(Progress::state(entry)),
+            None => {
+                let due = self.last_line.is_none_or(|t| t.elapsed() >= QUIET) || entry.step == self.steps;
+                if due {
+                    self.last_line = Some(Instant::now());
+                    let rate = self.rate();
+                    let left = duration((self.steps - entry.step) as f64 / rate.max(1e-9));
+                    let state = Progress::state(entry);
+                    eprintln!("step {}/{}  {rate:.1} steps/s  ETA {left}  {state}", entry.step, self.steps);
+                }
+            }
+        }
+    }
+
+    fn finishing(&mut self) {
+        match &self.bar {
+            Some(bar) => bar.finish(),
+            None => eprintln!("training done, writing pictures and report"),
+        }
+    }
+}
+
+/// The bar ends where it is when a run stops early or fails.
+impl Drop for Progress {
+    fn drop(&mut self) {
+        if let Some(bar) = self.bar.as_ref().filter(|b| !b.is_finished()) {
+            bar.abandon();
+        }
+    }
+}

@@ -1,0 +1,74 @@
+//! `raygrad train`.
+
+use crate::Choice;
+use crate::progress::Progress;
+use anyhow::Context;
+use clap::Args;
+use raygrad::Outcome;
+use raygrad::config::Count;
+use raygrad::report::duration;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+#[derive(Args)]
+pub struct TrainArgs {
+    #[command(flatten)]
+    choice: Choice,
+    /// Number of training steps.
+    #[arg(long, value_name = "N")]
+    steps: Option<String>,
+    /// Perturbation file to register, instead of a drawn one.
+    #[arg(long, value_name = "FILE")]
+    perturbation: Option<String>,
+    /// Run folder; by default the first free one of runs/PRESET, runs/PRESET-2, ...
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Continue the run that the folder holds, bit by bit where it was left.
+    #[arg(long)]
+    resume: bool,
+}
+
+pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
+    let mut experiment = args.choice.experiment()?.resume(args.resume);
+    let options =
+        [("--steps", "optim.steps", &args.steps), ("--perturbation", "data.perturbation", &args.perturbation)];
+    for (option, key, value) in options {
+        if let Some(value) = value {
+            experiment.set_option(option, key, value).map_err(raygrad::Error::from)?;
+        }
+    }
+    if let Some(out) = &args.out {
+        experiment = experiment.out(out);
+    }
+    let stop = Arc::new(AtomicBool::new(false));
+    let handler = stop.clone();
+    ctrlc::set_handler(move || {
+        // The first asks for a checkpoint, the second does not wait for it.
+        if handler.swap(true, Ordering::Relaxed) {
+            std::process::exit(130);
+        }
+    })
+    .context("cannot listen for Ctrl-C")?;
+    let outcome = experiment.train_observed(&mut Progress::new(), &stop)?;
+    Ok(tell(&outcome, &experiment.layered.settings.data.points_per_patch))
+}
+
+fn tell(outcome: &Outcome, points: &Count) -> ExitCode {
+    let folder = outcome.folder.display();
+    if outcome.interrupted {
+        println!("stopped; continue with the same command and `--out {folder} --resume`");
+        return ExitCode::from(130);
+    }
+    if let Some(last) = &outcome.metrics.last {
+        let errors: Vec<String> = last.entry.corner_error_px.per_patch.iter().map(|e| format!("{e:.2}")).collect();
+        let (mean, psnr) = (last.entry.corner_error_px.mean, last.entry.patch_psnr_db);
+        println!("corner error  {mean:.3} px  (patches: {})", errors.join(", "));
+        println!("patch PSNR    {psnr:.2} dB");
+        let drawn = if *points == Count::All { "" } else { ", measured on all pixels" };
+        println!("steps         {} in {}{drawn}", last.entry.step, duration(last.seconds));
+    }
+    println!("results       {folder}/report.html");
+    ExitCode::SUCCESS
+}

@@ -1,0 +1,46 @@
+//! Everything that can end an experiment early.
+
+use crate::config::ConfigError;
+use crate::pictures::PictureError;
+use crate::planar::DataError;
+use crate::report::PlotError;
+use crate::run::files::WriteError;
+use crate::run::{CheckpointError, FolderError};
+use raygrad_compiler::StepError;
+use raygrad_runtime::{DeviceError, RunError};
+
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    #[error(transparent)]
+    Data(#[from] DataError),
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+    #[error(transparent)]
+    Folder(#[from] FolderError),
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    #[error(transparent)]
+    Write(#[from] WriteError),
+    #[error(transparent)]
+    Picture(#[from] PictureError),
+    #[error(transparent)]
+    Plot(#[from] PlotError),
+    #[error("the model does not compile: {0}")]
+    Compile(#[from] StepError),
+    #[error(transparent)]
+    Run(#[from] RunError),
+    #[error("`{what}` is not finite after step {step}; the last checkpoint is unharmed")]
+    NotFinite { what: String, step: usize },
+}
+
+impl Error {
+    /// Whether what the user gave is at fault, or the disk it goes to, and not the computation.
+    pub fn is_bad_input(&self) -> bool {
+        !matches!(
+            self,
+            Error::Picture(_) | Error::Plot(_) | Error::Compile(_) | Error::Run(_) | Error::NotFinite { .. }
+        )
+    }
+}

@@ -1,0 +1,224 @@
+//! An experiment from settings to results: the one way to train, for the command and for programs.
+//!
+//! ```no_run
+//! # fn main() -> Result<(), raygrad::Error> {
+//! use raygrad::Experiment;
+//! let outcome = Experiment::preset("planar-l2g-small")?.set("optim.steps=500")?.out("runs/first").train()?;
+//! println!("{} px", outcome.metrics.last.map_or(f64::NAN, |f| f.entry.corner_error_px.mean));
+//! # Ok(())
+//! # }
+//! ```
+
+use crate::Error;
+use crate::config::{ConfigError, DeviceChoice, Layered, Origin};
+use crate::planar::{PlanarData, Trainer};
+use crate::run::checkpoint::Checkpoint;
+use crate::run::metrics::{Entry, Final, Metrics};
+use crate::run::{RunFolder, results};
+use crate::warps::{self, Warp};
+use raygrad_runtime::{Device, DeviceError};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+/// Settings, and what a program may add to them.
+#[derive(Clone)]
+pub struct Experiment {
+    pub layered: Layered,
+    warp: Option<Arc<dyn Warp>>,
+    device: Option<Device>,
+    out: Option<PathBuf>,
+    resume: bool,
+}
+
+/// What a finished or interrupted run gives back.
+#[derive(Clone, Debug)]
+pub struct Outcome {
+    pub metrics: Metrics,
+    pub folder: PathBuf,
+    /// Whether it was stopped before its last step; it can be resumed.
+    pub interrupted: bool,
+}
+
+/// Told how a run gets on. Every method does nothing unless it is given.
+pub trait Observer {
+    /// The run begins, or goes on, after `done` of `steps` steps.
+    fn begin(&mut self, _folder: &Path, _done: usize, _steps: usize) {}
+    /// A step was submitted.
+    fn step(&mut self, _done: usize) {}
+    /// A step was measured.
+    fn measured(&mut self, _entry: &Entry) {}
+    /// Training has ended; pictures and report follow.
+    fn finishing(&mut self) {}
+}
+
+/// An observer that is not interested.
+pub struct Quiet;
+impl Observer for Quiet {}
+
+impl Experiment {
+    /// A built-in preset, or a file if the name ends in `.toml`.
+    pub fn preset(name: &str) -> Result<Experiment, Error> {
+        Ok(Experiment { layered: Layered::load(name)?, warp: None, device: None, out: None, resume: false })
+    }
+
+    /// Sets one value, as in `optim.steps=500`.
+    pub fn set(mut self, assignment: &str) -> Result<Experiment, Error> {
+        self.layered.set(assignment)?;
+        Ok(self)
+    }
+
+    /// Sets one value on behalf of an option of its own, which errors then name.
+    pub fn set_option(&mut self, option: &str, key: &str, value: &str) -> Result<(), ConfigError> {
+        self.layered.assign(key, value, Origin::Option(format!("{option} {value}")))
+    }
+
+    /// Registers by a warp of one's own instead of the settings' one.
+    pub fn warp(mut self, warp: impl Warp + 'static) -> Experiment {
+        self.warp = Some(Arc::new(warp));
+        self
+    }
+
+    /// The photo to register patches of.
+    pub fn image(mut self, path: impl AsRef<Path>) -> Experiment {
+        self.layered.settings.data.image = path.as_ref().to_string_lossy().into_owned();
+        self
+    }
+
+    /// Where to compute, instead of the settings' device.
+    pub fn device(mut self, device: Device) -> Experiment {
+        self.device = Some(device);
+        self
+    }
+
+    /// The run folder; by default the first free one of `runs/NAME`, `runs/NAME-2`, ...
+    pub fn out(mut self, folder: impl Into<PathBuf>) -> Experiment {
+        self.out = Some(folder.into());
+        self
+    }
+
+    /// Continues the run that the folder holds.
+    pub fn resume(mut self, resume: bool) -> Experiment {
+        self.resume = resume;
+        self
+    }
+
+    /// Trains to the last step.
+    pub fn train(&self) -> Result<Outcome, Error> {
+        self.train_observed(&mut Quiet, &AtomicBool::new(false))
+    }
+
+    /// Checks everything, compiles, and fills the device: a trainer before its first step.
+    pub fn trainer(&self) -> Result<Trainer, Error> {
+        self.layered.validate()?;
+        let settings = &self.layered.settings;
+        let data = PlanarData::load(&self.layered)?;
+        let device = match &self.device {
+            Some(device) => device.clone(),
+            None => open_device(settings.run.device, settings.run.threads.limit())?,
+        };
+        let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings));
+        Trainer::new(settings, data, warp, device)
+    }
+
+    /// Trains until the last step is done or `stop` is set, which ends the run with a checkpoint.
+    pub fn train_observed(&self, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<Outcome, Error> {
+        self.layered.validate()?;
+        let settings = &self.layered.settings;
+        let path = self.out.clone().unwrap_or_else(|| RunFolder::default_path(&self.layered.name, self.resume));
+        // Refuse a folder before the work of compiling, and again look at it before the first write.
+        let mut folder = match self.resume {
+            true => RunFolder::reopen(&path, settings)?,
+            false => RunFolder::claim(&path, settings)?,
+        };
+        let mut trainer = self.trainer()?;
+        let mut run = Run { metrics: Metrics::default(), seconds: 0.0, begun: Instant::now() };
+        if self.resume {
+            let checkpoint = Checkpoint::load(&path, &trainer.checkpoint_shapes())?;
+            trainer.restore(&checkpoint)?;
+            (run.metrics.steps, run.seconds) = (checkpoint.steps, checkpoint.seconds);
+        } else {
+            folder.start(settings)?;
+            results::write_data(&folder, settings, &trainer.data)?;
+        }
+        folder.keep();
+        run.begun = Instant::now();
+        observer.begin(&path, trainer.steps_done(), settings.optim.steps);
+        let interrupted = self.run_steps(&mut run, &mut trainer, &folder, observer, stop)?;
+        if !interrupted {
+            observer.finishing();
+            let evaluation = trainer.evaluate()?;
+            let warps = evaluation.warps.iter().map(|w| std::array::from_fn(|i| w.0[(i / 3, i % 3)])).collect();
+            run.metrics.last = Some(Final { entry: evaluation.entry.clone(), seconds: run.elapsed(), warps });
+            results::write_results(&folder, &self.layered, &mut trainer, &evaluation, &run.metrics)?;
+        }
+        folder.write("metrics.json", run.metrics.to_json().as_bytes())?;
+        Ok(Outcome { metrics: run.metrics, folder: path, interrupted })
+    }
+
+    /// The steps that are left; whether they were cut short.
+    fn run_steps(
+        &self,
+        run: &mut Run,
+        trainer: &mut Trainer,
+        folder: &RunFolder,
+        observer: &mut dyn Observer,
+        stop: &AtomicBool,
+    ) -> Result<bool, Error> {
+        let (steps, every) = (self.layered.settings.optim.steps, &self.layered.settings.run);
+        let due = |period: usize, done: usize| period > 0 && done.is_multiple_of(period);
+        if trainer.steps_done() == 0 && every.picture_every > 0 {
+            results::write_frame(folder, trainer)?;
+        }
+        while trainer.steps_done() < steps {
+            if stop.load(Ordering::Relaxed) {
+                run.checkpoint(trainer, folder)?;
+                return Ok(true);
+            }
+            trainer.step()?;
+            let done = trainer.steps_done();
+            if due(every.log_every, done) || done == steps {
+                let entry = trainer.measure()?;
+                observer.measured(&entry);
+                run.metrics.steps.push(entry);
+            }
+            if due(every.picture_every, done) {
+                results::write_frame(folder, trainer)?;
+            }
+            if due(every.checkpoint_every, done) || done == steps {
+                run.checkpoint(trainer, folder)?;
+            }
+            observer.step(done);
+        }
+        Ok(false)
+    }
+}
+
+/// What accumulates over a run.
+struct Run {
+    metrics: Metrics,
+    /// Time of the parts before this one.
+    seconds: f64,
+    begun: Instant,
+}
+
+impl Run {
+    fn elapsed(&self) -> f64 {
+        self.seconds + self.begun.elapsed().as_secs_f64()
+    }
+    fn checkpoint(&self, trainer: &mut Trainer, folder: &RunFolder) -> Result<(), Error> {
+        let (step, seconds, steps) = (trainer.steps_done(), self.elapsed(), self.metrics.steps.clone());
+        Checkpoint { step, seconds, steps, tensors: trainer.tensors()? }.save(folder.path())?;
+        Ok(())
+    }
+}
+
+/// The device that settings ask for.
+pub fn open_device(choice: DeviceChoice, threads: Option<usize>) -> Result<Device, DeviceError> {
+    match choice {
+        DeviceChoice::Auto => Device::auto(threads),
+        DeviceChoice::Cpu => Device::cpu(threads),
+        DeviceChoice::Wgpu(_) => Err(DeviceError::NotBuilt),
+    }
+}

@@ -1,0 +1,107 @@
+//! Curves over training, drawn as SVG.
+
+use plotters::prelude::*;
+
+/// One line of a plot.
+#[derive(Clone, Debug)]
+pub struct Curve {
+    pub label: String,
+    pub color: [u8; 3],
+    /// Width of the line.
+    pub width: u32,
+    /// (step, value) pairs.
+    pub points: Vec<(f64, f64)>,
+}
+
+/// A plot that could not be drawn.
+#[derive(Debug, thiserror::Error)]
+#[error("cannot draw the plot of {what}: {problem}")]
+pub struct PlotError {
+    what: String,
+    problem: String,
+}
+
+const SIZE: (u32, u32) = (640, 340);
+const FONT: &str = "system-ui, sans-serif";
+
+/// An SVG of the curves, with a logarithmic vertical axis if asked for and possible.
+pub fn plot(what: &str, curves: &[Curve], logarithmic: bool) -> Result<String, PlotError> {
+    let values: Vec<f64> = curves.iter().flat_map(|c| &c.points).map(|p| p.1).filter(|v| v.is_finite()).collect();
+    let positive = values.iter().copied().filter(|v| *v > 0.0).fold(f64::INFINITY, f64::min);
+    let (low, high) = values.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(l, h), v| (l.min(*v), h.max(*v)));
+    let last = curves.iter().flat_map(|c| &c.points).map(|p| p.0).fold(1.0, f64::max);
+    let mut svg = String::new();
+    let drawn = if values.is_empty() {
+        Ok(())
+    } else if logarithmic && positive.is_finite() && high > positive {
+        draw(&mut svg, what, curves, last, (positive * 0.8, high * 1.25), true)
+    } else {
+        let margin = ((high - low) * 0.05).max(1e-9);
+        draw(&mut svg, what, curves, last, (low - margin, high + margin), false)
+    };
+    drawn.map_err(|e| PlotError { what: what.to_string(), problem: e.to_string() })?;
+    Ok(svg)
+}
+
+type Drawn = Result<(), Box<dyn std::error::Error>>;
+
+fn draw(svg: &mut String, what: &str, curves: &[Curve], last: f64, (low, high): (f64, f64), log: bool) -> Drawn {
+    let root = SVGBackend::with_string(svg, SIZE).into_drawing_area();
+    root.fill(&WHITE)?;
+    let mut builder = ChartBuilder::on(&root);
+    builder.margin(12).x_label_area_size(34).y_label_area_size(62);
+    // The two kinds of axes are different types: the same lines twice.
+    if log {
+        let mut chart = builder.build_cartesian_2d(0.0..last, (low..high).log_scale())?;
+        chart.configure_mesh().label_style((FONT, 13)).light_line_style(WHITE).x_desc("step").y_desc(what).draw()?;
+        for curve in curves {
+            let points = curve.points.iter().copied().map(|(x, y)| (x, y.max(low)));
+            let style = style(curve);
+            let drawn = chart.draw_series(LineSeries::new(points, style))?;
+            drawn.label(&curve.label).legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], style));
+        }
+        legend(curves, || {
+            Ok(chart.configure_series_labels().label_font((FONT, 13)).background_style(WHITE.mix(0.8)).draw()?)
+        })?;
+    } else {
+        let mut chart = builder.build_cartesian_2d(0.0..last, low..high)?;
+        chart.configure_mesh().label_style((FONT, 13)).light_line_style(WHITE).x_desc("step").y_desc(what).draw()?;
+        for curve in curves {
+            let style = style(curve);
+            let drawn = chart.draw_series(LineSeries::new(curve.points.iter().copied(), style))?;
+            drawn.label(&curve.label).legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], style));
+        }
+        legend(curves, || {
+            Ok(chart.configure_series_labels().label_font((FONT, 13)).background_style(WHITE.mix(0.8)).draw()?)
+        })?;
+    }
+    root.present()?;
+    Ok(())
+}
+
+fn style(curve: &Curve) -> ShapeStyle {
+    let [r, g, b] = curve.color;
+    RGBColor(r, g, b).stroke_width(curve.width)
+}
+
+/// A single curve is named by its axis.
+fn legend(curves: &[Curve], draw: impl FnOnce() -> Drawn) -> Drawn {
+    if curves.len() > 1 { draw() } else { Ok(()) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn plots_of_anything_finite_or_not() {
+        let curve = |points: Vec<(f64, f64)>| Curve { label: "a".into(), color: [0; 3], width: 2, points };
+        let cases = [vec![], vec![(1.0, 0.0)], vec![(1.0, 0.5), (2.0, 0.01)], vec![(1.0, f64::NAN), (2.0, 1.0)]];
+        for points in cases {
+            for logarithmic in [false, true] {
+                let svg = plot("loss", &[curve(points.clone()), curve(vec![])], logarithmic).unwrap();
+                assert!(points.is_empty() || svg.starts_with("<svg"));
+            }
+        }
+    }
+}

@@ -1,0 +1,201 @@
+//! Tests of a warp in two lines.
+//!
+//! [`check_gradients`] compares first and second derivatives with central differences of the f64 reference, and what
+//! every device computes with the reference itself. [`plan`] is the text of everything the warp compiles to, for a
+//! snapshot test.
+
+use crate::config::Dof;
+use crate::data::Random;
+use crate::warps::{Points, Registration, Warp, codes};
+use raygrad_compiler::autodiff::{grad, zeros_like};
+use raygrad_compiler::functions::mlp::Init;
+use raygrad_compiler::graph::topological;
+use raygrad_compiler::ops::input::Input;
+use raygrad_compiler::reference::{Array, Bindings, Direction, EvalError, central_difference, evaluate};
+use raygrad_compiler::{Axis, Shape, Step, StepError, Target, Tensor, compile};
+use raygrad_runtime::{Device, DeviceError, RunError, Session};
+
+/// A derivative or a device that disagrees with the reference.
+#[derive(Debug, thiserror::Error)]
+pub enum TestError {
+    #[error("{order} derivative by `{input}`: the graph gives {found}, central differences give {expected}")]
+    Gradient { order: &'static str, input: String, found: f64, expected: f64 },
+    #[error("`{output}` on {device}: {found}, in the reference {expected}")]
+    Device { device: String, output: String, found: f64, expected: f64 },
+    #[error("the warp maps to {found}, expected {expected}")]
+    Shape { expected: Shape, found: Shape },
+    #[error(transparent)]
+    Evaluate(#[from] EvalError),
+    #[error(transparent)]
+    Compile(#[from] StepError),
+    #[error(transparent)]
+    Open(#[from] DeviceError),
+    #[error(transparent)]
+    Run(#[from] RunError),
+}
+
+const FRAMES: usize = 3;
+const POINTS: usize = 7;
+/// Steps of the central differences, and what may be lost to them, relative to the derivative.
+const STEPS: [f64; 3] = [1e-4, 1e-5, 1e-6];
+const TOLERANCE: f64 = 1e-5;
+/// Relative tolerance of f32 on a device.
+const SINGLE: f64 = 2e-4;
+
+/// A warp on a few random points, and a scalar that depends on every number it gives.
+struct Bench {
+    scalar: Tensor,
+    local: Tensor,
+    /// Points, code and parameters.
+    inputs: Vec<Tensor>,
+    bindings: Bindings,
+}
+
+impl Bench {
+    fn new(warp: &dyn Warp) -> Result<Bench, TestError> {
+        let (frame, point) = (Axis::new("frame", FRAMES), Axis::new("point", POINTS));
+        let xy = Tensor::parameter("points", Shape::new(&[&frame, &point], 2));
+        let at = Points { frame: frame.clone(), point: point.clone(), xy: xy.clone() };
+        let code = codes(warp, &frame);
+        let none = Tensor::scalar(0.0);
+        let found = Registration::new(warp, &at, code.as_ref().map_or(&none, |c| &c.tensor), false);
+        let expected = Shape::new(&[&frame, &point], 2);
+        if found.local.error().is_none() && *found.local.shape() != expected {
+            return Err(TestError::Shape { expected, found: found.local.shape().clone() });
+        }
+        let mut random = Random::new(0, "testing");
+        let mut bindings = Bindings::new();
+        let upstream = Tensor::data("upstream", expected);
+        let mut scalar = (&found.local * upstream).sum_channels().sum(&[&frame, &point]);
+        // The other fits are constants to the derivative, which is exact for the first order alone, see `warps::fit`.
+        if let Some(residual) = found.residual.as_ref().filter(|_| warp.dof() == Dof::Homography) {
+            scalar = scalar + residual;
+        }
+        for t in topological([scalar.clone()]) {
+            let Some(Input { name, shape, .. }) = t.op_as::<Input>() else { continue };
+            let values = (0..shape.lanes()).map(|_| 0.5 * random.normal()).collect();
+            bindings.insert(name.clone(), Array::floats(shape, values));
+        }
+        let parameters: Vec<_> = code.into_iter().chain(warp.parameters()).collect();
+        for p in &parameters {
+            let spread = match p.init {
+                Init::Zero => 0.1,
+                Init::Uniform(bound) => bound,
+                Init::Normal(deviation) => 0.3 * deviation,
+            };
+            let values = (0..p.tensor.shape().lanes()).map(|_| spread * (2.0 * random.uniform() - 1.0)).collect();
+            bindings
+                .insert(p.tensor.input_name().unwrap_or_default().to_string(), Array::floats(p.tensor.shape(), values));
+        }
+        let inputs = [xy].into_iter().chain(parameters.into_iter().map(|p| p.tensor)).collect();
+        Ok(Bench { scalar, local: found.local, inputs, bindings })
+    }
+
+    /// Derivative of `scalar` along `direction` of one input, as a graph.
+    fn along(&self, scalar: &Tensor, input: &Tensor, direction: &[f64]) -> Tensor {
+        let name = format!("direction.{}", input.input_name().unwrap_or_default());
+        debug_assert_eq!(input.shape().lanes(), direction.len());
+        let pulled = grad(scalar, &[input]).remove(0);
+        (pulled * Tensor::data(name, input.shape().clone()))
+            .reshape(input.width())
+            .sum_channels()
+            .sum_over(input.axes())
+    }
+
+    fn check(
+        &self,
+        order: &'static str,
+        scalar: &Tensor,
+        bindings: &Bindings,
+        random: &mut Random,
+    ) -> Result<(), TestError> {
+        for input in &self.inputs {
+            let name = input.input_name().unwrap_or_default();
+            let direction: Vec<f64> = (0..input.shape().lanes()).map(|_| random.normal()).collect();
+            let mut bindings = bindings.clone();
+            // The second order differentiates along the first one's direction again.
+            bindings.insert(format!("direction.{name}"), Array::floats(input.shape(), direction.clone()));
+            let slope = self.along(scalar, input, &direction);
+            let found = evaluate(std::slice::from_ref(&slope), &bindings)?[0].f()[0];
+            let differences = |step| central_difference(scalar, &bindings, name, &Direction::Along(&direction), step);
+            let agrees = |expected: f64| (found - expected).abs() <= TOLERANCE * (1.0 + expected.abs());
+            // A difference across a kink (of a rectifier) is no derivative: a shorter one does not reach it.
+            let expected = differences(STEPS[0])?;
+            if !agrees(expected) && !agrees(differences(STEPS[1])?) && !agrees(differences(STEPS[2])?) {
+                return Err(TestError::Gradient { order, input: name.to_string(), found, expected });
+            }
+            if order == "first" {
+                self.check("second", &slope, &bindings, random)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Values and gradients as one step.
+    fn step(&self) -> Step {
+        let gradients = grad(&self.scalar, &self.inputs.iter().collect::<Vec<_>>());
+        let named = self.inputs.iter().zip(gradients).map(|(input, g)| {
+            let g = g.broadcast_to(input.axes()) + zeros_like(input);
+            (format!("gradient of {}", input.input_name().unwrap_or_default()), g)
+        });
+        Step {
+            outputs: [("points".to_string(), self.local.clone())].into_iter().chain(named).collect(),
+            updates: vec![],
+        }
+    }
+}
+
+/// Checks the derivatives of a warp, first and second order, and its values and gradients on every device there is.
+pub fn check_gradients(warp: &dyn Warp) -> Result<(), TestError> {
+    let bench = Bench::new(warp)?;
+    bench.check("first", &bench.scalar, &bench.bindings, &mut Random::new(1, "testing"))?;
+    let step = bench.step();
+    let expected = evaluate(&step.roots(), &bench.bindings)?;
+    for (name, device) in devices()? {
+        let mut session = Session::new(device.clone())?;
+        let program = session.add(compile(&step, &device.target())?)?;
+        for (input, value) in &bench.bindings {
+            if session.inputs().any(|(known, _)| known == input) {
+                session.set(input, &value.f().iter().map(|v| *v as f32).collect::<Vec<_>>())?;
+            }
+        }
+        session.run(program)?;
+        for ((output, _), expected) in step.outputs.iter().zip(&expected) {
+            let scale = expected.f().iter().fold(1.0, |m: f64, v| m.max(v.abs()));
+            for (found, expected) in session.read(program, output)?.iter().zip(expected.f()) {
+                let (device, output, found) = (name.clone(), output.clone(), f64::from(*found));
+                // Written so that a value that is not a number fails too.
+                if (found - expected).abs() <= SINGLE * scale {
+                    continue;
+                }
+                return Err(TestError::Device { device, output, found, expected: *expected });
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The plan of a warp with its gradients, for CPU and GPU: what a snapshot test compares.
+pub fn plan(warp: &dyn Warp) -> Result<String, TestError> {
+    let mut bench = Bench::new(warp)?;
+    // Data in training, so no gradient goes there.
+    bench.inputs.retain(|t| t.input_name() != Some("points"));
+    let step = bench.step();
+    let (cpu, gpu) = (compile(&step, &Target::cpu())?, compile(&step, &Target::gpu())?);
+    Ok(format!("cpu\n{cpu}\ngpu\n{gpu}"))
+}
+
+fn devices() -> Result<Vec<(String, Device)>, DeviceError> {
+    Ok(vec![("cpu".to_string(), Device::cpu(Some(1))?)])
+}
+
+/// Compares the kernels of a warp with a reviewed snapshot; the calling crate needs `insta`.
+#[macro_export]
+macro_rules! assert_kernels {
+    ($name:expr, $warp:expr) => {
+        match $crate::testing::plan($warp) {
+            Ok(plan) => insta::assert_snapshot!($name, plan),
+            Err(error) => panic!("{error}"),
+        }
+    };
+}

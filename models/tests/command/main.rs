@@ -1,0 +1,5 @@
+//! The command `raygrad`, from outside.
+
+mod bad_input;
+mod results;
+mod workplace;

@@ -1,0 +1,159 @@
+//! The command from outside: what a run leaves behind, and that it can be stopped and resumed bit by bit.
+
+use crate::workplace::{Workplace, names, stderr};
+use serde_json::Value;
+use std::io::{BufRead, BufReader};
+use std::process::Stdio;
+
+fn json(w: &Workplace, name: &str) -> Value {
+    serde_json::from_slice(&std::fs::read(w.path(name)).unwrap()).unwrap()
+}
+
+#[test]
+fn a_run_leaves_metrics_pictures_checkpoint_and_report() {
+    let w = Workplace::new();
+    let output = w.succeed(&["train", "tiny.toml", "--out", "run"]);
+    assert!(output.contains("corner error") && output.contains("report.html"), "{output}");
+    let mut found = names(&w.path("run"));
+    found.sort();
+    let expected = [
+        "checkpoint-0000012.safetensors",
+        "checkpoint.json",
+        "config.toml",
+        "frames",
+        "learned.png",
+        "metrics.json",
+        "patches.png",
+        "perturbation.json",
+        "photo.png",
+        "reconstruction.png",
+        "report.html",
+        "training.png",
+        "warp_field.png",
+    ];
+    assert_eq!(found, expected);
+    let metrics = json(&w, "run/metrics.json");
+    let steps: Vec<u64> = metrics["steps"].as_array().unwrap().iter().map(|s| s["step"].as_u64().unwrap()).collect();
+    assert_eq!(steps, [4, 8, 12]);
+    for entry in metrics["steps"].as_array().unwrap().iter().chain([&metrics["final"]]) {
+        assert!(entry["patch_psnr_db"].as_f64().unwrap() > 0.0);
+        assert_eq!(entry["corner_error_px"]["per_patch"].as_array().unwrap().len(), 3);
+        assert!(entry["corner_error_px"]["mean"].as_f64().unwrap().is_finite());
+        for term in ["render", "alignment", "total"] {
+            assert!(entry["loss"][term].as_f64().unwrap() >= 0.0, "{term}");
+        }
+    }
+    assert!(metrics["final"]["seconds"].as_f64().unwrap() > 0.0);
+    let report = std::fs::read_to_string(w.path("run/report.html")).unwrap();
+    assert!(report.contains("<svg") && report.contains("data:image/png;base64,"));
+    assert!(!report.contains("src=\"http"), "the report needs no network");
+    // The resolved settings are an experiment of their own: the same run again.
+    w.succeed(&["train", "run/config.toml", "--out", "again"]);
+    assert_eq!(json(&w, "again/metrics.json")["steps"], metrics["steps"]);
+}
+
+#[test]
+fn threads_do_not_change_results() {
+    let w = Workplace::new();
+    w.succeed(&["train", "tiny.toml", "--out", "one", "--threads", "1"]);
+    w.succeed(&["train", "tiny.toml", "--out", "two", "--threads", "2"]);
+    let tensors = |run: &str| std::fs::read(w.path(&format!("{run}/checkpoint-0000012.safetensors"))).unwrap();
+    assert!(tensors("one") == tensors("two"));
+}
+
+#[test]
+fn presets_perturbations_and_methods() {
+    let w = Workplace::new();
+    assert!(w.succeed(&["presets"]).contains("planar-l2g-small"));
+    assert!(w.succeed(&["devices"]).contains("cpu"));
+    w.succeed(&["train", "tiny.toml", "--out", "l2g"]);
+    let variants: &[&[&str]] = &[
+        &["warp.method=global", "loss.alignment=0"],
+        &["warp.method=none"],
+        &["warp.method=global", "field.encoding=full"],
+        &["field.encoding=none"],
+        &["warp.dof=1"],
+        &["warp.dof=2"],
+        &["warp.dof=3"],
+        &["warp.solver=eigen"],
+        &["warp.fix_first=false"],
+        &["loss.alignment=0"],
+        &["data.points_per_patch=all"],
+    ];
+    for (i, variant) in variants.iter().enumerate() {
+        let out = format!("variant{i}");
+        let mut args = vec!["train", "tiny.toml", "--perturbation", "l2g/perturbation.json", "--out", &out];
+        args.extend(variant.iter().flat_map(|v| ["--set", v]));
+        w.succeed(&args);
+        let perturbation = |run: &str| json(&w, &format!("{run}/perturbation.json"))["perturbation"].clone();
+        assert_eq!(perturbation(&out), perturbation("l2g"));
+    }
+    // Known warps are exact.
+    assert!(json(&w, "variant1/metrics.json")["final"]["corner_error_px"]["mean"].as_f64().unwrap() < 1e-3);
+}
+
+#[test]
+fn default_folders_are_numbered() {
+    let w = Workplace::new();
+    for _ in 0..2 {
+        w.succeed(&["train", "tiny.toml", "--steps", "1"]);
+    }
+    let mut runs = names(&w.path("runs"));
+    runs.sort();
+    assert_eq!(runs, ["tiny", "tiny-2"]);
+}
+
+/// Stops a run by Ctrl-C, resumes it, and compares it with one that was never stopped.
+#[cfg(unix)]
+#[test]
+fn an_interrupted_run_resumes_bit_by_bit() {
+    let w = Workplace::new();
+    let long = ["--steps", "400", "--set", "run.log_every=1", "--set", "run.picture_every=100"];
+    let args = |out: &'static str| [&["train", "tiny.toml", "--out", out], &long[..]].concat();
+    w.succeed(&args("whole"));
+    let mut child = w.command(&args("parts")).stderr(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+    // The first measurement is printed after the first step.
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    assert!(lines.by_ref().map_while(Result::ok).any(|l| l.starts_with("step ")));
+    let kill = std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(kill.success());
+    lines.for_each(drop);
+    assert_eq!(child.wait().unwrap().code(), Some(130));
+    let done = json(&w, "parts/checkpoint.json")["step"].as_u64().unwrap();
+    assert!(done > 0 && done < 400, "stopped at {done}");
+    assert!(json(&w, "parts/metrics.json")["final"].is_null());
+    let mut resumed = args("parts");
+    resumed.push("--resume");
+    let output = w.run(&resumed);
+    assert!(output.status.success(), "{}", stderr(&output));
+    assert_eq!(json(&w, "parts/metrics.json")["steps"], json(&w, "whole/metrics.json")["steps"]);
+    let tensors = |run: &str| std::fs::read(w.path(&format!("{run}/checkpoint-0000400.safetensors"))).unwrap();
+    assert!(tensors("parts") == tensors("whole"));
+    let animation = |run: &str| std::fs::read(w.path(&format!("{run}/training.png"))).unwrap();
+    assert!(animation("parts") == animation("whole"));
+}
+
+#[test]
+fn bench_prints_the_numbers_of_a_step() {
+    let w = Workplace::new();
+    let text = w.succeed(&["bench", "tiny.toml", "--steps", "3", "--json"]);
+    let bench: Value = serde_json::from_str(&text).unwrap();
+    for key in ["seconds_per_step", "gflop_per_step", "gflops", "peak_gflops", "peak_rss_mb"] {
+        assert!(bench[key].as_f64().unwrap() > 0.0, "{key}: {text}");
+    }
+    // Rows x weights x 6: the field 14-16-16-3 and the warp 8-16-(16+8)-16-3.
+    let weights = (14 * 16 + 16 * 16 + 16 * 3) + (8 * 16 + 24 * 16 + 16 * 3);
+    let expected = 6.0 * 3.0 * 40.0 * f64::from(weights) / 1e9;
+    assert!((bench["gflop_per_step"].as_f64().unwrap() / expected - 1.0).abs() < 1e-9, "{text}");
+}
+
+#[test]
+fn explain_prints_the_plan_and_writes_artefacts() {
+    let w = Workplace::new();
+    assert!(!w.succeed(&["explain", "tiny.toml"]).is_empty());
+    assert!(w.succeed(&["explain", "tiny.toml", "--timing"]).contains("fuse"));
+    let graph = w.succeed(&["explain", "tiny.toml", "--emit", "graph"]);
+    assert!(graph.contains("output render") && graph.contains("update warp.code"));
+    w.succeed(&["explain", "tiny.toml", "--emit", "plan", "--out", "artefacts"]);
+    assert_eq!(names(&w.path("artefacts")), ["plan.txt"]);
+}

@@ -1,0 +1,189 @@
+//! Adapters and the device opened on one.
+
+use super::{api, bytes};
+use crate::{DeviceError, RunError};
+use raygrad_kernels::gpu::{Arena, Limits};
+use std::future::Future;
+use std::pin::pin;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::task::{Context, Poll, Waker};
+
+/// An adapter as listed for people.
+#[derive(Clone, Debug)]
+pub struct Adapter {
+    pub name: String,
+    pub backend: &'static str,
+    pub device_type: &'static str,
+    pub driver: String,
+    /// A GPU, not software.
+    pub is_gpu: bool,
+}
+
+/// An open device.
+pub struct Gpu {
+    pub(super) device: api::Device,
+    pub(super) queue: api::Queue,
+    adapter: Adapter,
+    limits: Limits,
+    /// The first error nobody was asked about: wgpu reports most of them late.
+    failed: Arc<Mutex<Option<String>>>,
+}
+
+impl Gpu {
+    /// All adapters, in the order that `wgpu:N` counts.
+    pub fn list() -> Vec<Adapter> {
+        adapters().iter().map(describe).collect()
+    }
+
+    /// The adapter numbered `index`, or the best one: dedicated before integrated before virtual before software.
+    pub fn open(index: Option<usize>) -> Result<Gpu, DeviceError> {
+        let all = adapters();
+        let chosen = match index {
+            Some(i) => all.into_iter().nth(i).ok_or_else(|| DeviceError::NoAdapter(format!("number {i}")))?,
+            None => {
+                let best = all.into_iter().min_by_key(|a| rank(a.get_info().device_type));
+                best.ok_or_else(|| DeviceError::NoAdapter("found".into()))?
+            }
+        };
+        Gpu::on(&chosen)
+    }
+
+    /// A real GPU, if there is one.
+    pub fn auto() -> Option<Gpu> {
+        let mut all = adapters();
+        all.retain(|a| describe(a).is_gpu);
+        all.sort_by_key(|a| rank(a.get_info().device_type));
+        all.iter().find_map(|a| Gpu::on(a).ok())
+    }
+
+    fn on(adapter: &api::Adapter) -> Result<Gpu, DeviceError> {
+        let info = describe(adapter);
+        let limits = adapter.limits();
+        let descriptor = api::DeviceDescriptor {
+            label: Some("raygrad"),
+            required_limits: limits.clone(),
+            memory_hints: api::MemoryHints::Performance,
+            ..Default::default()
+        };
+        let (device, queue) = block_on(adapter.request_device(&descriptor))
+            .map_err(|e| DeviceError::Adapter { name: info.name.clone(), reason: e.to_string() })?;
+        let failed: Arc<Mutex<Option<String>>> = Arc::default();
+        let on_error = failed.clone();
+        device.on_uncaptured_error(Arc::new(move |e: api::Error| {
+            let what = match &e {
+                api::Error::OutOfMemory { .. } => "out of memory".to_string(),
+                other => other.to_string(),
+            };
+            note(&on_error, what);
+        }));
+        let on_loss = failed.clone();
+        device.set_device_lost_callback(move |reason, message| {
+            if reason != api::DeviceLostReason::Destroyed {
+                note(&on_loss, format!("the device was lost: {message}"));
+            }
+        });
+        let limits = Limits {
+            max_binding: limits.max_storage_buffer_binding_size.min(limits.max_buffer_size),
+            max_workgroups: limits.max_compute_workgroups_per_dimension,
+        };
+        Ok(Gpu { device, queue, adapter: info, limits, failed })
+    }
+
+    pub fn adapter(&self) -> &Adapter {
+        &self.adapter
+    }
+
+    pub(super) fn name(&self) -> String {
+        self.adapter.name.clone()
+    }
+
+    pub(super) fn limits(&self) -> Limits {
+        self.limits
+    }
+
+    pub(super) fn problem(&self, problem: String) -> RunError {
+        RunError::Device { device: self.name(), problem }
+    }
+
+    /// The first error since the last check.
+    pub(super) fn check(&self) -> Result<(), RunError> {
+        match self.failed.lock().unwrap_or_else(PoisonError::into_inner).take() {
+            Some(problem) => Err(self.problem(problem)),
+            None => Ok(()),
+        }
+    }
+
+    /// Waits for a submission, or for all.
+    pub(super) fn wait(&self, submission_index: Option<api::SubmissionIndex>) -> Result<(), RunError> {
+        let poll = api::PollType::Wait { submission_index, timeout: None };
+        self.device.poll(poll).map_err(|e| self.problem(e.to_string()))?;
+        self.check()
+    }
+
+    /// A zeroed device buffer for an arena.
+    pub(super) fn buffer(&self, arena: &Arena) -> Result<api::Buffer, RunError> {
+        let buffer = self.device.create_buffer(&api::BufferDescriptor {
+            label: Some(&arena.name),
+            size: bytes(arena),
+            usage: api::BufferUsages::STORAGE | api::BufferUsages::COPY_SRC | api::BufferUsages::COPY_DST,
+            mapped_at_creation: false,
+        });
+        self.check().map_err(|e| match e {
+            RunError::Device { problem, .. } => {
+                self.problem(format!("`{}`, {} bytes: {problem}", arena.name, bytes(arena)))
+            }
+            other => other,
+        })?;
+        Ok(buffer)
+    }
+}
+
+fn note(slot: &Mutex<Option<String>>, what: String) {
+    slot.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(what);
+}
+
+fn adapters() -> Vec<api::Adapter> {
+    let mut descriptor = api::InstanceDescriptor::new_without_display_handle();
+    descriptor.flags = api::InstanceFlags::empty();
+    let instance = api::Instance::new(descriptor);
+    block_on(instance.enumerate_adapters(api::Backends::PRIMARY))
+}
+
+fn rank(t: api::DeviceType) -> u32 {
+    match t {
+        api::DeviceType::DiscreteGpu => 0,
+        api::DeviceType::IntegratedGpu => 1,
+        api::DeviceType::VirtualGpu => 2,
+        api::DeviceType::Other => 3,
+        api::DeviceType::Cpu => 4,
+    }
+}
+
+fn describe(adapter: &api::Adapter) -> Adapter {
+    let info = adapter.get_info();
+    Adapter {
+        name: info.name,
+        backend: info.backend.to_str(),
+        device_type: match info.device_type {
+            api::DeviceType::DiscreteGpu => "dedicated GPU",
+            api::DeviceType::IntegratedGpu => "integrated GPU",
+            api::DeviceType::VirtualGpu => "virtual GPU",
+            api::DeviceType::Cpu => "software",
+            api::DeviceType::Other => "unknown",
+        },
+        driver: format!("{} {}", info.driver, info.driver_info).trim().to_string(),
+        is_gpu: rank(info.device_type) <= 2,
+    }
+}
+
+/// Runs a future of wgpu's: on native backends they are ready at once.
+fn block_on<T>(future: impl Future<Output = T>) -> T {
+    let mut future = pin!(future);
+    let mut context = Context::from_waker(Waker::noop());
+    loop {
+        if let Poll::Ready(value) = future.as_mut().poll(&mut context) {
+            return value;
+        }
+        std::thread::yield_now();
+    }
+}

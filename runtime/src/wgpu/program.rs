@@ -1,0 +1,120 @@
+//! A program on the device: pipelines and bind groups, made once.
+
+use super::api;
+use super::gpu::Gpu;
+use crate::RunError;
+use raygrad_compiler::plan::region::BufferId;
+use raygrad_kernels::gpu::{ArenaId, GpuProgram, Kernel, Place};
+use std::borrow::Cow;
+
+struct Dispatch {
+    pipeline: api::ComputePipeline,
+    bindings: api::BindGroup,
+    workgroups: [u32; 3],
+}
+
+pub(super) struct Loaded {
+    /// Device buffers of the program's own arenas.
+    pub arenas: Vec<api::Buffer>,
+    dispatches: Vec<Dispatch>,
+    places: Vec<(Place, usize)>,
+}
+
+impl Loaded {
+    pub fn new(gpu: &Gpu, program: GpuProgram, inputs: &[api::Buffer]) -> Result<Loaded, RunError> {
+        let arenas = program.arenas.iter().map(|a| gpu.buffer(a)).collect::<Result<Vec<_>, _>>()?;
+        let mut loaded = Loaded { arenas, dispatches: vec![], places: program.places };
+        for kernel in program.launches.into_iter().flat_map(|l| l.kernels) {
+            let dispatch = loaded.dispatch(gpu, kernel, inputs)?;
+            loaded.dispatches.push(dispatch);
+        }
+        Ok(loaded)
+    }
+
+    fn dispatch(&self, gpu: &Gpu, kernel: Kernel, inputs: &[api::Buffer]) -> Result<Dispatch, RunError> {
+        let name = kernel.name;
+        let label = Some(&*name);
+        let entries: Vec<api::BindGroupLayoutEntry> = kernel
+            .bindings
+            .iter()
+            .enumerate()
+            .map(|(i, b)| api::BindGroupLayoutEntry {
+                binding: i as u32,
+                visibility: api::ShaderStages::COMPUTE,
+                ty: api::BindingType::Buffer {
+                    ty: api::BufferBindingType::Storage { read_only: !b.writable },
+                    has_dynamic_offset: false,
+                    min_binding_size: None,
+                },
+                count: None,
+            })
+            .collect();
+        let layout = gpu.device.create_bind_group_layout(&api::BindGroupLayoutDescriptor { label, entries: &entries });
+        let entries: Vec<api::BindGroupEntry> = kernel
+            .bindings
+            .iter()
+            .enumerate()
+            .map(|(i, b)| {
+                let buffer = match b.arena {
+                    ArenaId::Input(a) => &inputs[a],
+                    ArenaId::Own(a) => &self.arenas[a],
+                };
+                api::BindGroupEntry { binding: i as u32, resource: buffer.as_entire_binding() }
+            })
+            .collect();
+        let bindings =
+            gpu.device.create_bind_group(&api::BindGroupDescriptor { label, layout: &layout, entries: &entries });
+        let source = api::ShaderSource::Naga(Cow::Owned(kernel.module));
+        // SAFETY: the lowering derives every index from the kernel's own dispatch size and the layout it binds, clamps
+        // the indices of gathers, and bounds every loop by a constant, so no access is out of range and every loop ends.
+        let module = unsafe {
+            gpu.device.create_shader_module_trusted(
+                api::ShaderModuleDescriptor { label, source },
+                api::ShaderRuntimeChecks::unchecked(),
+            )
+        };
+        let layout = gpu.device.create_pipeline_layout(&api::PipelineLayoutDescriptor {
+            label,
+            bind_group_layouts: &[Some(&layout)],
+            immediate_size: 0,
+        });
+        let pipeline = gpu.device.create_compute_pipeline(&api::ComputePipelineDescriptor {
+            label,
+            layout: Some(&layout),
+            module: &module,
+            entry_point: Some("main"),
+            compilation_options: api::PipelineCompilationOptions {
+                zero_initialize_workgroup_memory: false,
+                ..Default::default()
+            },
+            cache: None,
+        });
+        gpu.check().map_err(|e| match e {
+            RunError::Device { device, problem } => {
+                RunError::Device { device, problem: format!("kernel `{name}`: {problem}") }
+            }
+            other => other,
+        })?;
+        Ok(Dispatch { pipeline, bindings, workgroups: kernel.workgroups })
+    }
+
+    /// Records and submits all dispatches.
+    pub fn submit(&self, gpu: &Gpu) -> api::SubmissionIndex {
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        {
+            let mut pass = encoder.begin_compute_pass(&Default::default());
+            for d in &self.dispatches {
+                pass.set_pipeline(&d.pipeline);
+                pass.set_bind_group(0, &d.bindings, &[]);
+                let [x, y, z] = d.workgroups;
+                pass.dispatch_workgroups(x, y, z);
+            }
+        }
+        gpu.queue.submit([encoder.finish()])
+    }
+
+    /// Where a buffer lies, with its length in lanes.
+    pub fn place(&self, buffer: BufferId) -> (Place, usize) {
+        self.places[buffer.0 as usize]
+    }
+}

@@ -1,0 +1,55 @@
+//! The wgpu backend against the f64 reference, on whatever adapter there is; in tests that is software.
+//!
+//! Without an adapter these tests fail, unless `RAYGRAD_NO_GPU=1` says that none is expected.
+#![cfg(feature = "wgpu")]
+
+use raygrad_compiler::Step;
+use raygrad_compiler::autodiff::grad;
+use raygrad_compiler::graph::Tensor;
+use raygrad_compiler::ops::registry;
+use raygrad_runtime::Device;
+use raygrad_tests::backend::compare;
+use raygrad_tests::{MidGraph, total};
+
+/// The best adapter; `None` only where the environment says that there is none.
+fn device() -> Option<Device> {
+    match Device::wgpu(None) {
+        Ok(device) => Some(device),
+        Err(e) if std::env::var_os("RAYGRAD_NO_GPU").is_some_and(|v| v == "1") => {
+            println!("skipped, RAYGRAD_NO_GPU is set: {e}");
+            None
+        }
+        Err(e) => panic!("{e}; install a Vulkan driver (mesa-vulkan-drivers), or set RAYGRAD_NO_GPU=1 to skip"),
+    }
+}
+
+/// Value, gradients, and gradients of the gradients' squares.
+fn step(graph: &MidGraph, differentiable: bool) -> Step {
+    let mut outputs = vec![("value".to_string(), graph.output.clone()), ("loss".into(), graph.loss.clone())];
+    if differentiable {
+        let wanted: Vec<&Tensor> = graph.parameters.iter().collect();
+        let first = grad(&graph.loss, &wanted);
+        outputs.extend(first.iter().enumerate().map(|(i, g)| (format!("grad p{i}"), g.clone())));
+        if let Some(squares) = first.iter().map(|g| total(&(g * g))).reduce(|a, b| a + b) {
+            let second = grad(&squares, &wanted);
+            outputs.extend(second.into_iter().enumerate().map(|(i, g)| (format!("second p{i}"), g)));
+        }
+    }
+    Step { outputs, updates: vec![] }
+}
+
+#[test]
+fn every_op() {
+    let Some(device) = device() else { return };
+    let only = std::env::var("RAYGRAD_ONLY").ok();
+    let mut failures = vec![];
+    for sample in registry().into_iter().filter(|s| only.as_ref().is_none_or(|o| s.name.contains(o.as_str()))) {
+        let graph = MidGraph::new(&sample);
+        let start = std::time::Instant::now();
+        if let Err(e) = compare(&device, &step(&graph, sample.differentiable), &graph.bindings, 2e-5) {
+            failures.push(format!("{}: {e}", sample.name));
+        }
+        println!("{:5} ms  {}", start.elapsed().as_millis(), sample.name);
+    }
+    assert!(failures.is_empty(), "{} ops fail\n{}", failures.len(), failures.join("\n\n"));
+}
