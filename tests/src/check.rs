@@ -1,13 +1,14 @@
-//! What must hold of any step: the same values simplified and recorded, on every device and in the f64 reference, for any
-//! number of threads, and in the step after.
+//! What must hold of any step: the same values simplified and recorded, planned for every target, on every device and in
+//! the f64 reference, for any number of threads, and in the step after.
 
 use crate::backend::{load, round};
 use crate::worst;
 use raygrad_compiler::graph::{Tensor, topological};
+use raygrad_compiler::plan::{Buffer, BufferKind};
 use raygrad_compiler::reference::{Array, Bindings, Data, evaluate};
 use raygrad_compiler::scalar::DType;
 use raygrad_compiler::simplify::simplify;
-use raygrad_compiler::{Step, compile};
+use raygrad_compiler::{Step, Target, compile};
 use raygrad_runtime::Device;
 use std::collections::HashMap;
 
@@ -97,11 +98,34 @@ fn values(t: &Tensor, lanes: &[u32]) -> Vec<f64> {
     lanes.iter().map(value).collect()
 }
 
+/// Results of the plan for `target`, run in f64.
+fn planned(step: &Step, bindings: &Bindings, target: &Target) -> Result<Results, String> {
+    let program = compile(step, target).map_err(|e| e.to_string())?;
+    let buffers = crate::plan::run(&program, bindings).map_err(|e| format!("{e}\n{program}"))?;
+    let input = |t: &Tensor| {
+        let named = |b: &Buffer| matches!(&b.kind, BufferKind::Input { name, .. } if Some(&**name) == t.input_name());
+        program.buffers.iter().position(named).expect("an updated input has a buffer")
+    };
+    let outputs = program.outputs.iter().map(|(_, b)| buffers[b.0 as usize].clone());
+    let values = outputs.chain(step.updates.iter().map(|(t, _)| buffers[input(t)].clone())).collect();
+    Ok(name(step, values))
+}
+
 /// All properties of one step.
 pub fn check(devices: &[Device], step: &Step, bindings: &Bindings) -> Result<(), String> {
     let bindings = round(bindings);
     let reference = expected(step, &bindings);
     agree("the simplified graph", &reference, &expected(&simplify(step), &bindings), 1e-9, || Some(vec![]))?;
+    for target in [Target::cpu(), Target::gpu()] {
+        let noise = || Some(rounded(step, &bindings));
+        agree(
+            &format!("the plan for {:?}", target.kind),
+            &reference,
+            &planned(step, &bindings, &target)?,
+            1e-5,
+            noise,
+        )?;
+    }
     for device in devices {
         let what = format!("{:?}", device.target().kind);
         for (at, (before, results)) in found(device, step, &bindings).iter().enumerate() {

@@ -3,6 +3,7 @@
 pub mod backend;
 pub mod check;
 pub mod graphs;
+pub mod plan;
 pub mod vectors;
 
 use raygrad_compiler::autodiff::grad;

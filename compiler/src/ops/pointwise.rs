@@ -7,6 +7,9 @@ use crate::scalar::{DType, ScalarBuilder, ScalarProgram, Val};
 use std::fmt::Debug;
 use std::sync::Arc;
 
+/// Most operands of a pointwise op.
+const MAX_OPERANDS: usize = 3;
+
 /// An op that works lane by lane. Implementing this gives an [`Op`] through [`map`].
 pub trait Pointwise: Debug + Clone + Send + Sync + 'static {
     fn name(&self) -> &'static str;
@@ -71,8 +74,11 @@ impl<P: Pointwise> Op for Map<P> {
 
     fn eval(&self, inputs: &[&Array], out: &Shape) -> Array {
         Array::from_fn(out, |element, channel| {
-            let args: Vec<Lane> = inputs.iter().map(|a| a.lane(out, element, channel)).collect();
-            self.0.eval(&args)
+            let mut args = [Lane::U(0); MAX_OPERANDS];
+            for (arg, a) in args.iter_mut().zip(inputs) {
+                *arg = a.lane(out, element, channel);
+            }
+            self.0.eval(&args[..inputs.len()])
         })
     }
 

@@ -92,14 +92,24 @@ impl Array {
             Data::U(v) => Lane::U(v[i]),
         }
     }
-    /// This array's element that an element of `domain` sees: broadcasting by name.
+    /// This array's element that an element of `domain` sees: broadcasting by name. Axes that the domain lacks count as 0.
     pub fn element_of(&self, domain: &Shape, element: usize) -> usize {
-        let strides = self.shape.axes.strides_in(&domain.axes);
-        let mut rest = element;
-        let mut at = 0;
-        for (axis, stride) in domain.axes.iter().zip(strides).rev() {
-            at += rest % axis.size() * stride;
+        if self.shape.axes == domain.axes {
+            return element;
+        }
+        // Both sets of axes are sorted: one walk from the innermost outwards.
+        let mut own = self.shape.axes.iter().rev().peekable();
+        let (mut at, mut stride, mut rest) = (0, 1, element);
+        for axis in domain.axes.iter().rev() {
+            let position = rest % axis.size();
             rest /= axis.size();
+            while let Some(further) = own.next_if(|a| *a > axis) {
+                stride *= further.size();
+            }
+            if own.next_if_eq(&axis).is_some() {
+                at += position * stride;
+                stride *= axis.size();
+            }
         }
         at
     }
