@@ -15,7 +15,8 @@ fn global_warps() {
 
 #[test]
 fn local_warps() {
-    for dof in ALL {
+    // The local group differs from the global one only for the last.
+    for dof in [Dof::Rigid, Dof::Homography] {
         let mut layered = Layered::load("planar-l2g").unwrap();
         for set in ["warp.code=4", "warp.layers=[8,8,8]", "warp.skip=[2]", "warp.solver=eigen"] {
             layered.set(set).unwrap();

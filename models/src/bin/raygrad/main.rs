@@ -82,6 +82,7 @@ impl Choice {
 }
 
 fn main() -> ExitCode {
+    quiet_drivers();
     let done = match Cli::parse().command {
         Command::Train(args) => train::run(&args),
         Command::Devices => devices(),
@@ -100,6 +101,15 @@ fn main() -> ExitCode {
             }
             ExitCode::from(if bad_input == Some(true) { 2 } else { 1 })
         }
+    }
+}
+
+/// Mesa's drivers print an error, for windows that nobody asked for, where this variable is not set: in containers, as
+/// root.
+fn quiet_drivers() {
+    if std::env::var_os("XDG_RUNTIME_DIR").is_none() {
+        // SAFETY: the first thing the program does; no other thread runs that could read the environment.
+        unsafe { std::env::set_var("XDG_RUNTIME_DIR", std::env::temp_dir()) };
     }
 }
 
