@@ -129,7 +129,9 @@ impl Gpu {
             mapped_at_creation: false,
         });
         self.check().map_err(|e| match e {
-            RunError::Device { problem, .. } => self.problem(format!("`{}`, {} bytes: {problem}", arena.name, bytes(arena))),
+            RunError::Device { problem, .. } => {
+                self.problem(format!("`{}`, {} bytes: {problem}", arena.name, bytes(arena)))
+            }
             other => other,
         })?;
         Ok(buffer)
