@@ -6,8 +6,14 @@ use crate::ops::Form;
 use crate::plan::region::Grain;
 use std::collections::HashMap;
 
-/// Channels from which a pointwise value counts as wide on a GPU.
+/// Channels from which a value counts as wide on a GPU.
 const WIDE: usize = 65;
+/// Channels from which everything pointwise after a layer belongs to its epilogue; below, only what takes nothing else.
+const EPILOGUE: usize = 16;
+/// Channels from which sums of groups of channels are worth an invocation each.
+const GROUPS: usize = 8;
+/// Weights of an element's own layer from which its outputs are worth an invocation each.
+const OWN_WEIGHTS: usize = 128;
 
 /// The node whose lanes `t` has: reshapes, broadcasts and markers are seen through.
 pub(super) fn resolve(t: &Tensor) -> Tensor {
@@ -31,6 +37,8 @@ pub(super) struct Info {
     /// Its result is complete only when its region ends.
     pub reduces: bool,
     pub free: bool,
+    /// Whether one of its channels can be computed without the others, from inputs on.
+    pub by_lane: bool,
     pub depth: usize,
     /// Operations to compute one element from inputs and what is surely stored.
     pub closure_flops: u64,
@@ -113,10 +121,16 @@ impl Cuts {
             operands,
             reduces,
             free: false,
+            by_lane: false,
             depth: 0,
             closure_flops: 0,
         };
         info.grain = self.grain(&info);
+        info.by_lane = match info.form {
+            Form::Input | Form::Const(_) | Form::Index { .. } | Form::Take { .. } => true,
+            Form::Pointwise(_) | Form::Pick(_) | Form::Identity => info.operands.iter().all(|o| self.get(o).by_lane),
+            _ => false,
+        };
         let shapes: Vec<_> = info.operands.iter().map(|o| o.shape().clone()).collect();
         let own = t.op().flops(&shapes, t.shape());
         let computed = |o: &&Tensor| !self.get(o).reduces;
@@ -151,14 +165,29 @@ impl Cuts {
         info
     }
 
-    /// GPU: wide pointwise values and layers work lane by lane, everything else row by row.
+    /// GPU: layers with the pointwise values after them, and wide values, work lane by lane, everything else row by row.
     fn grain(&self, info: &Info) -> Grain {
+        let width = info.tensor.width();
+        let along = |o: &Tensor| {
+            let operand = self.get(o);
+            operand.grain == Grain::Lane && operand.domain == info.domain && operand.inner == info.inner
+        };
         let wide = match &info.form {
-            Form::Linear { .. } => info.shared_weights(),
-            Form::Pointwise(_) | Form::Const(_) => info.tensor.width() >= WIDE,
-            Form::Pick(_) => info.tensor.width() >= WIDE,
-            Form::Identity => info.tensor.width() >= WIDE,
-            Form::Reduce(_) => info.tensor.width() >= WIDE,
+            Form::Linear { .. } => info.shared_weights() || info.operands[1].width() >= OWN_WEIGHTS,
+            Form::Pointwise(_) => {
+                let after = |o: &&Tensor| along(o) && o.width() == width;
+                let only =
+                    || info.operands.iter().filter(|o| !after(o)).all(|o| self.get(o).free && o.axes().is_empty());
+                width >= WIDE || info.operands.iter().any(|o| after(&o)) && (width >= EPILOGUE || only())
+            }
+            Form::ChannelSum(_) => {
+                let operand = self.get(&info.operands[0]);
+                width >= GROUPS
+                    && along(&info.operands[0])
+                    && matches!(operand.form, Form::Pointwise(_) | Form::Pick(_))
+            }
+            Form::Identity => along(&info.operands[0]),
+            Form::Const(_) | Form::Pick(_) | Form::Reduce(_) => width >= WIDE,
             _ => false,
         };
         if wide && self.target.kind == TargetKind::Gpu { Grain::Lane } else { Grain::Row }
@@ -172,11 +201,13 @@ impl Cuts {
             return operand.form != Form::Input && !(weights && self.is_view(&user.operands[i]));
         }
         let gpu = self.target.kind == TargetKind::Gpu;
-        let layer = matches!(user.form, Form::Linear { .. }) && user.shared_weights();
+        let layer = matches!(user.form, Form::Linear { .. }) && user.grain == Grain::Lane;
         if gpu && (layer || user.form == Form::Outer && user.reduces) {
             return true;
         }
-        if gpu && user.grain == Grain::Lane && operand.tensor.width() > 1 && operand.grain == Grain::Row {
+        let computable = operand.free && operand.by_lane;
+        let wide_row = operand.tensor.width() > 1 && operand.grain == Grain::Row;
+        if gpu && user.grain == Grain::Lane && wide_row && !computable {
             return true;
         }
         if operand.free {

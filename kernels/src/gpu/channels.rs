@@ -85,9 +85,8 @@ pub(super) fn runs_of(op: &RegionOp) -> Vec<Run> {
         _ => 0,
     };
     let all: Vec<Parts> = (0..channels).map(|c| parts(op, c)).collect();
-    let alike = |a: &Parts, b: &Parts| {
-        a.len() == b.len() && a.iter().zip(b).all(|(x, y)| (x.0, x.2, x.3) == (y.0, y.2, y.3))
-    };
+    let alike =
+        |a: &Parts, b: &Parts| a.len() == b.len() && a.iter().zip(b).all(|(x, y)| (x.0, x.2, x.3) == (y.0, y.2, y.3));
     let formulas = |from: usize, to: usize| -> Option<Vec<Linear>> {
         (0..all[from].len()).map(|t| linear(&all[from..to].iter().map(|p| p[t].1).collect::<Vec<_>>())).collect()
     };
@@ -201,7 +200,12 @@ mod tests {
 
     #[test]
     fn every_formula_gives_the_channels_it_stands_for() {
-        for list in [vec![4, 2, 0, 5, 3, 1], vec![7], vec![0, 0, 1, 1, 2, 2, 9, 9], (0..64).map(|i| i % 8 * 8 + i / 8).collect()] {
+        for list in [
+            vec![4, 2, 0, 5, 3, 1],
+            vec![7],
+            vec![0, 0, 1, 1, 2, 2, 9, 9],
+            (0..64).map(|i| i % 8 * 8 + i / 8).collect(),
+        ] {
             let op = RegionOp::Pick(list.iter().map(|c| (0, *c)).collect::<Vec<_>>().into());
             for run in runs_of(&op) {
                 for c in run.first..run.end {

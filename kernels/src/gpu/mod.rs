@@ -6,7 +6,7 @@
 //! | `layout` | where buffers lie: a few arenas |
 //! | `memory` | a kernel being built: arenas bound, positions in the domain |
 //! | `channels`, `eval`, `scalar`, `eigen` | values of a region at a position |
-//! | `parts` | a region cut into what one kind of kernel does |
+//! | `parts`, `stages` | a region cut into what one kind of kernel does, and long work into stages |
 //! | `elements`, `reduce`, `scatter`, `scan`, `layer`, `outer`, `tile` | the kinds of kernels |
 
 mod builder;
@@ -24,6 +24,7 @@ mod reduce;
 mod scalar;
 mod scan;
 mod scatter;
+mod stages;
 mod tile;
 
 pub use layout::{Arena, ArenaId, Inputs, Limits, Place};

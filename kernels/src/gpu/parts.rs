@@ -6,13 +6,12 @@
 
 use super::elements::{self, closure};
 use super::layout::{Layout, Limits};
-use super::{Kernel, LowerError, layer, outer, reduce, scan, scatter};
+use super::{Kernel, LowerError, layer, outer, reduce, scan, scatter, stages};
 use raygrad_compiler::graph::{Axes, Shape};
 use raygrad_compiler::ops::Reduction;
 use raygrad_compiler::plan::Launch;
 use raygrad_compiler::plan::region::{BufferId, Inst, InstId, Region, RegionOp, Store};
 use raygrad_compiler::scalar::DType;
-use std::collections::HashMap;
 
 /// Most products of an `Outer` that single invocations accumulate.
 const SMALL_OUTER: usize = 64;
@@ -53,7 +52,14 @@ pub(super) fn lower(layout: &mut Layout, limits: Limits, launch: &Launch) -> Res
     for (i, part) in parts.into_iter().enumerate() {
         let name = if several { format!("{}.{}", launch.name, part_name(&part, i)) } else { launch.name.clone() };
         match part {
-            Part::Elements(r) => kernels.extend(elements::kernels(layout, limits, &name, &r)?),
+            Part::Elements(r) => {
+                let stages = stages::stages(layout, r)?;
+                let several = stages.len() > 1;
+                for (i, stage) in stages.iter().enumerate() {
+                    let name = if several { format!("{name}.stage_{}", i + 1) } else { name.clone() };
+                    kernels.extend(elements::kernels(layout, limits, &name, stage)?);
+                }
+            }
             Part::Layer(r, linear) => kernels.push(layer::kernel(layout, limits, &name, &r, linear)?),
             Part::Scan(r) => kernels.push(scan::kernel(layout, limits, &name, &r)?),
             Part::Reduce(r) => kernels.extend(reduce::kernels(layout, limits, &name, &r)?),
@@ -179,7 +185,7 @@ impl Split<'_, '_> {
         }
         for (_, mut region) in reductions {
             region.body = self.region.body.clone();
-            self.sums.push(Part::Reduce(prune(region)));
+            self.sums.push(Part::Reduce(region.swept()));
         }
         Ok(())
     }
@@ -212,7 +218,7 @@ impl Split<'_, '_> {
         let shape = Shape::of(self.region.domain.clone(), inst.channels, inst.dtype);
         let buffer = self.layout.scratch(&inst.label.clone(), shape)?;
         let stores = vec![Store::Write { value, buffer }];
-        self.sums.push(Part::Elements(prune(Region { stores, ..self.region.clone() })));
+        self.sums.push(Part::Elements(Region { stores, ..self.region.clone() }.swept()));
         Ok(self.push_load(into, buffer))
     }
 
@@ -243,7 +249,7 @@ impl Split<'_, '_> {
             let mut region = self.region.clone();
             region.stores.extend(on_lines);
             if !region.stores.is_empty() {
-                self.writers.push(Part::Scan(prune(region)));
+                self.writers.push(Part::Scan(region.swept()));
             }
             return Ok(());
         }
@@ -265,7 +271,7 @@ impl Split<'_, '_> {
             for (id, buffer) in cut.iter().filter(|c| homes.home[c.0.0 as usize] != Some(level)) {
                 replace_by_load(self.layout, &mut region, *id, *buffer);
             }
-            let (region, renamed) = prune_with(region, *linear);
+            let (region, renamed) = swept_with(region, *linear);
             self.writers.push(Part::Layer(region, renamed));
         }
         let rest: Vec<Store> = stores.into_iter().filter(|s| home(s).is_none()).collect();
@@ -274,7 +280,7 @@ impl Split<'_, '_> {
             for (id, buffer) in &cut {
                 replace_by_load(self.layout, &mut region, *id, *buffer);
             }
-            self.writers.push(Part::Elements(prune(region)));
+            self.writers.push(Part::Elements(region.swept()));
         }
         Ok(())
     }
@@ -387,34 +393,17 @@ fn push_load(layout: &Layout, region: &mut Region, buffer: BufferId) -> InstId {
     InstId(region.body.len() as u32 - 1)
 }
 
-fn replace_by_load(layout: &Layout, region: &mut Region, id: InstId, buffer: BufferId) {
+/// Makes a value a load of `buffer`.
+pub(super) fn replace_by_load(layout: &Layout, region: &mut Region, id: InstId, buffer: BufferId) {
     let axes = layout.shape(buffer).axes.clone();
     let inst = &mut region.body[id.0 as usize];
     debug_assert!(inst.dtype == DType::F32 || layout.shape(buffer).dtype == inst.dtype);
     *inst = Inst { op: RegionOp::Load(buffer), inputs: vec![], axes, ..inst.clone() };
 }
 
-/// Drops what no store needs.
-fn prune(region: Region) -> Region {
+/// Drops what no store needs; also tells the new id of a value that is needed.
+fn swept_with(region: Region, id: InstId) -> (Region, InstId) {
     let needed = closure(&region, region.stores.iter().flat_map(|s| s.values()));
-    prune_to(region, &needed).0
-}
-
-/// Likewise; also tells the new id of a value that is needed.
-fn prune_with(region: Region, id: InstId) -> (Region, InstId) {
-    let needed = closure(&region, region.stores.iter().flat_map(|s| s.values()));
-    let (region, renamed) = prune_to(region, &needed);
-    (region, renamed[&id])
-}
-
-fn prune_to(region: Region, needed: &[bool]) -> (Region, HashMap<InstId, InstId>) {
-    let mut renamed = HashMap::new();
-    let mut body = vec![];
-    for (at, inst) in region.body.iter().enumerate().filter(|(at, _)| needed[*at]) {
-        renamed.insert(InstId(at as u32), InstId(body.len() as u32));
-        let inputs = inst.inputs.iter().map(|i| renamed[i]).collect();
-        body.push(Inst { inputs, ..inst.clone() });
-    }
-    let stores = region.stores.iter().map(|s| s.map_values(|v| renamed[&v])).collect();
-    (Region { body, stores, ..region }, renamed)
+    let before = needed[..id.0 as usize].iter().filter(|n| **n).count();
+    (region.swept(), InstId(before as u32))
 }

@@ -1,0 +1,274 @@
+//! The wgpu backend at sizes that need several workgroups, chunks, ragged tiles, and many steps.
+#![cfg(feature = "wgpu")]
+
+use raygrad_compiler::autodiff::grad;
+use raygrad_compiler::functions::adam::{Adam, Moments, StepScalars};
+use raygrad_compiler::graph::{Axes, Axis, Shape, Tensor};
+use raygrad_compiler::ops::input::Role;
+use raygrad_compiler::reference::{Array, Bindings, evaluate};
+use raygrad_compiler::scalar::DType;
+use raygrad_compiler::{Step, compile};
+use raygrad_runtime::{Device, ProgramId, Session};
+use raygrad_tests::backend::compare;
+use raygrad_tests::{Rng, seed, total};
+
+/// The best adapter; `None` only where the environment says that there is none.
+fn device() -> Option<Device> {
+    match Device::wgpu(None) {
+        Ok(device) => Some(device),
+        Err(e) if std::env::var_os("RAYGRAD_NO_GPU").is_some_and(|v| v == "1") => {
+            println!("skipped, RAYGRAD_NO_GPU is set: {e}");
+            None
+        }
+        Err(e) => panic!("{e}; install a Vulkan driver (mesa-vulkan-drivers), or set RAYGRAD_NO_GPU=1 to skip"),
+    }
+}
+
+/// Binds every input of `step` to seeded numbers.
+fn bind(step: &Step, what: &str) -> Bindings {
+    let mut rng = Rng(seed(what));
+    let all = raygrad_compiler::graph::topological(step.roots());
+    let inputs = all.iter().filter_map(|t| t.input_name().map(|n| (n.to_string(), t.shape().clone())));
+    inputs
+        .map(|(name, shape)| {
+            let array = match shape.dtype {
+                DType::F32 => rng.array(&shape, -1.0, 1.0),
+                DType::U32 => Array::integers(&shape, (0..shape.lanes()).map(|_| rng.bits() as u32 % 32).collect()),
+            };
+            (name, array)
+        })
+        .collect()
+}
+
+fn check(device: &Device, outputs: Vec<(&str, Tensor)>, tolerance: f64, what: &str) {
+    let outputs = outputs.into_iter().map(|(n, t)| (n.to_string(), t)).collect();
+    let step = Step { outputs, updates: vec![] };
+    let bindings = bind(&step, what);
+    if let Err(e) = compare(device, &step, &bindings, tolerance) {
+        panic!("{what}: {e}");
+    }
+}
+
+/// A layer with bias and activation, its result and all gradients.
+fn layer(device: &Device, frames: usize, rows: usize, inputs: usize, outputs: usize, per_frame: bool) {
+    let (frame, row) = (Axis::new("frame", frames), Axis::new("row", rows));
+    let own: &[&Axis] = if per_frame { &[&frame] } else { &[] };
+    let x = Tensor::data("x", Shape::new(&[&frame, &row], inputs));
+    let w = Tensor::parameter("w", Shape::new(own, (inputs, outputs)));
+    let b = Tensor::parameter("b", Shape::new(own, outputs));
+    let y = (x.linear(&w) + &b).softplus(1.0);
+    let up = Tensor::data("up", y.shape().clone());
+    let loss = total(&(&y * up));
+    let gradients = grad(&loss, &[&x, &w, &b]);
+    let outputs_of =
+        vec![("y", y), ("dx", gradients[0].clone()), ("dw", gradients[1].clone()), ("db", gradients[2].clone())];
+    let what = format!("layer {frames}x{rows}, {inputs} to {outputs}, per frame: {per_frame}");
+    check(device, outputs_of, 2e-5, &what);
+}
+
+#[test]
+fn layers_of_all_widths() {
+    let Some(device) = device() else { return };
+    for (inputs, outputs) in [(2, 1), (3, 4), (5, 7), (16, 12), (34, 64), (64, 64), (64, 3), (70, 33), (130, 66)] {
+        layer(&device, 2, 333, inputs, outputs, false);
+    }
+    layer(&device, 3, 100, 20, 40, true);
+    layer(&device, 1, 4096, 8, 8, false);
+    layer(&device, 5, 1, 64, 128, true);
+}
+
+#[test]
+fn reductions_of_all_sizes() {
+    let Some(device) = device() else { return };
+    for (a, b) in [(1, 5000), (3, 70000), (5000, 7), (300, 300), (1, 1), (20000, 2)] {
+        let (outer, inner) = (Axis::new("outer", a), Axis::new("inner", b));
+        let x = Tensor::data("x", Shape::new(&[&outer, &inner], 3));
+        let y = x.sin();
+        let mean = |t: Tensor, n: usize| t * (1.0 / n as f64);
+        let outputs = vec![
+            ("inner", mean(y.sum(&[&inner]), b)),
+            ("outer", mean(y.sum(&[&outer]), a)),
+            ("all", mean(total(&y), a * b)),
+            ("max", y.max_over(&[&outer, &inner])),
+            ("max of channels", y.max_channels().max_over(&[&inner])),
+        ];
+        check(&device, outputs, 2e-5, &format!("reductions of {a} by {b}"));
+    }
+    let row = Axis::new("row", 3000);
+    let wide = Tensor::data("x", Shape::new(&[&row], 100));
+    let outputs = vec![("wide", wide.sin().sum(&[&row]) * (1.0 / 3000.0)), ("channels", wide.cos().sum_channels())];
+    check(&device, outputs, 2e-5, "reductions of 100 channels");
+}
+
+#[test]
+fn gathers_and_scatters() {
+    let Some(device) = device() else { return };
+    for (slots, rows, channels) in [(5, 3000, 1), (32, 40000, 3), (4, 700, 20), (2000, 5000, 2)] {
+        let (slot, row) = (Axis::new("slot", slots), Axis::new("row", rows));
+        let table = Tensor::parameter("table", Shape::new(&[&slot], channels));
+        let index = Tensor::data("index", Shape::new(&[&row], 1).with_dtype(DType::U32));
+        let y = table.take(&index, &slot).sin();
+        let up = Tensor::data("up", y.shape().clone());
+        let g = grad(&total(&(&y * up)), &[&table]);
+        check(&device, vec![("y", y), ("dt", g[0].clone())], 2e-5, &format!("{rows} rows of {slots} x {channels}"));
+    }
+}
+
+#[test]
+fn compositing() {
+    let Some(device) = device() else { return };
+    let (ray, sample) = (Axis::new("ray", 500), Axis::new("sample", 40));
+    let density = Tensor::parameter("density", Shape::new(&[&ray, &sample], 1));
+    let colour = Tensor::parameter("colour", Shape::new(&[&ray, &sample], 3));
+    let optical = density.softplus(1.0) * 0.1;
+    let transmittance = (-optical.cumsum(&sample)).exp();
+    let weights = transmittance * (1.0 - (-&optical).exp());
+    let pixel = (&weights * colour.sigmoid()).sum(&[&sample]);
+    let opacity = weights.sum(&[&sample]);
+    let target = Tensor::data("target", Shape::new(&[&ray], 3));
+    let difference = &pixel - target;
+    let smooth = &weights - weights.shift(&sample, 1);
+    let loss = (&difference * &difference).mean_all() + (&smooth * &smooth).mean_all();
+    let g = grad(&loss, &[&density, &colour]);
+    let outputs = vec![
+        ("pixel", pixel),
+        ("opacity", opacity),
+        ("weights", weights),
+        ("loss", loss),
+        ("d density", g[0].clone()),
+        ("d colour", g[1].clone()),
+    ];
+    check(&device, outputs, 2e-5, "compositing");
+}
+
+/// A network of three layers that learns a function by Adam: one step as a graph.
+struct Training {
+    step: Step,
+    initial: Bindings,
+    adam: Adam,
+}
+
+impl Training {
+    fn new() -> Training {
+        let row = Axis::new("row", 1000);
+        let x = Tensor::data("x", Shape::new(&[&row], 2));
+        let target = Tensor::data("target", Shape::new(&[&row], 3));
+        let widths = [2, 64, 64, 3];
+        let (mut h, mut parameters) = (x.clone(), vec![]);
+        for i in 0..3 {
+            let w = Tensor::parameter(format!("w{i}"), Shape::new(&[], (widths[i], widths[i + 1])));
+            let b = Tensor::parameter(format!("b{i}"), Shape::new(&[], widths[i + 1]));
+            h = h.linear(&w) + &b;
+            h = if i < 2 { h.relu() } else { h.sigmoid() };
+            parameters.extend([w, b]);
+        }
+        let difference = &h - target;
+        let loss = (&difference * &difference).mean_all();
+        let gradients = grad(&loss, &parameters.iter().collect::<Vec<_>>());
+        let scalar = |name: &str| Tensor::per_step(name, Shape::new(&[], 1));
+        let scalars = StepScalars { lr: scalar("lr"), bias1: scalar("bias1"), bias2: scalar("bias2") };
+        let adam = Adam::default();
+        let mut updates = vec![];
+        for (p, g) in parameters.iter().zip(&gradients) {
+            let old = Moments::of(p);
+            let (new, moments) = adam.update(p, g, &old, &scalars);
+            updates.extend([(p.clone(), new), (old.m, moments.m), (old.v, moments.v)]);
+        }
+        let step = Step { outputs: vec![("loss".into(), loss)], updates };
+        let mut initial = bind(&step, "training");
+        for (name, array) in &mut initial {
+            if name.starts_with("adam") {
+                array.f_mut().fill(0.0);
+            } else if name.starts_with('w') {
+                let wide = if name == "w0" { 1.0 } else { 0.2 };
+                array.f_mut().iter_mut().for_each(|x| *x = (*x * wide) as f32 as f64);
+            } else {
+                array.f_mut().iter_mut().for_each(|x| *x = *x as f32 as f64);
+            }
+        }
+        Training { step, initial, adam }
+    }
+
+    fn scalars(&self, t: u64) -> [(&'static str, f64); 3] {
+        let (bias1, bias2) = self.adam.bias_corrections(t);
+        [("lr", 3e-3), ("bias1", bias1), ("bias2", bias2)]
+    }
+
+    fn on(&self, device: &Device) -> (Session, ProgramId) {
+        let program = compile(&self.step, &device.target()).unwrap();
+        let mut session = Session::new(device.clone()).unwrap();
+        let id = session.add(program).unwrap();
+        for (name, array) in &self.initial {
+            session.set(name, &array.f().iter().map(|x| *x as f32).collect::<Vec<_>>()).unwrap();
+        }
+        (session, id)
+    }
+
+    /// Losses of some steps on a device, and the parameters after.
+    fn train(&self, device: &Device, steps: u64) -> (Vec<f32>, Vec<u32>) {
+        let (mut session, id) = self.on(device);
+        let mut losses = vec![];
+        for t in 1..=steps {
+            for (name, value) in self.scalars(t) {
+                session.set(name, &[value as f32]).unwrap();
+            }
+            session.run(id).unwrap();
+            losses.extend(session.read(id, "loss").unwrap());
+        }
+        let names: Vec<String> = session.inputs().filter(|i| i.1.role == Role::Parameter).map(|i| i.0.into()).collect();
+        (losses, names.iter().flat_map(|n| session.get_lanes(n).unwrap()).collect())
+    }
+
+    /// The same in f64.
+    fn reference(&self, steps: u64) -> Vec<f64> {
+        let mut bindings = self.initial.clone();
+        let mut losses = vec![];
+        for t in 1..=steps {
+            for (name, value) in self.scalars(t) {
+                bindings.insert(name.into(), Array::floats(&Shape::of(Axes::none(), 1, DType::F32), vec![value]));
+            }
+            let values = evaluate(&self.step.roots(), &bindings).unwrap();
+            losses.push(values[0].f()[0]);
+            for ((input, _), value) in self.step.updates.iter().zip(&values[1..]) {
+                bindings.insert(input.input_name().unwrap().into(), value.clone());
+            }
+        }
+        losses
+    }
+}
+
+#[test]
+fn training_follows_the_reference_and_repeats_bit_by_bit() {
+    let Some(device) = device() else { return };
+    let training = Training::new();
+    let (losses, parameters) = training.train(&device, 20);
+    let expected = training.reference(20);
+    for (t, (found, expected)) in losses.iter().zip(&expected).enumerate() {
+        let error = (*found as f64 - expected).abs() / expected;
+        assert!(error < 1e-4, "step {t}: {found} instead of {expected}\n{losses:?}\n{expected:?}");
+    }
+    assert!(losses[19] < 0.9 * losses[0], "{losses:?}");
+    let (again, parameters_again) = training.train(&device, 20);
+    assert_eq!(losses, again);
+    assert!(parameters == parameters_again, "the parameters differ in some bits");
+}
+
+#[test]
+fn two_programs_share_their_inputs() {
+    let Some(device) = device() else { return };
+    let row = Axis::new("row", 10);
+    let x = Tensor::parameter("x", Shape::new(&[&row], 2));
+    let extra = Tensor::data("extra", Shape::new(&[&row], 1));
+    let first = Step { outputs: vec![], updates: vec![(x.clone(), &x * 2.0)] };
+    let second = Step { outputs: vec![("sum".into(), (&x + extra).sum(&[&row]))], updates: vec![] };
+    let mut session = Session::new(device.clone()).unwrap();
+    let first = session.add(compile(&first, &device.target()).unwrap()).unwrap();
+    session.set("x", &[1.0; 20]).unwrap();
+    let second = session.add(compile(&second, &device.target()).unwrap()).unwrap();
+    session.set("extra", &[0.5; 10]).unwrap();
+    session.run(first).unwrap();
+    session.run(first).unwrap();
+    session.run(second).unwrap();
+    assert_eq!(session.read(second, "sum").unwrap(), [45.0, 45.0]);
+    assert_eq!(session.get("x").unwrap(), [4.0; 20]);
+}
