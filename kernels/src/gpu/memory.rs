@@ -51,7 +51,7 @@ impl<'l, 'a> Emit<'l, 'a> {
         let first = e.b.mul(e.workgroup, size);
         let number = e.b.add(first, e.invocation);
         e.b.name(number, "number");
-        if e.groups[1] > 1 || count % WORKGROUP as u64 != 0 {
+        if e.groups[1] > 1 || !count.is_multiple_of(WORKGROUP as u64) {
             e.leave_from(number, count as u32);
         }
         Ok((e, number))

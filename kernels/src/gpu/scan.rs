@@ -113,13 +113,15 @@ fn run(
     let element = position.element(e, &region.domain);
     for (store, vars) in pass.stores.iter().zip(&totals) {
         let id = store.values()[0];
+        // Only reductions have totals.
+        let mut totals = vars.iter();
         for c in 0..region.inst(id).channels {
             let value = values.channel(e, id, Channel::At(c as u32));
-            match store {
-                Store::Reduce { kind, .. } => {
-                    let so_far = e.b.get(vars[c]);
+            match (store, totals.next()) {
+                (Store::Reduce { kind, .. }, Some(total)) => {
+                    let so_far = e.b.get(*total);
                     let next = combine(&mut e.b, *kind, so_far, value);
-                    e.b.set(vars[c], next);
+                    e.b.set(*total, next);
                 }
                 _ => {
                     let c = e.b.u(c as u32);

@@ -23,15 +23,15 @@ impl Tile {
     /// A tile for a product of `n` columns and `k` terms: 64 invocations, fewer columns for narrow products.
     pub fn of(n: usize, k: usize) -> Tile {
         let deep = match k {
-            ..=4 => 4,
-            ..=8 => 8,
+            0..=4 => 4,
+            5..=8 => 8,
             _ => 16,
         };
         let (m, n, own_m, own_n) = match n {
-            ..=4 => (256, 4, 4, 4),
-            ..=8 => (128, 8, 4, 4),
-            ..=16 => (128, 16, 8, 4),
-            ..=32 => (64, 32, 8, 4),
+            0..=4 => (256, 4, 4, 4),
+            5..=8 => (128, 8, 4, 4),
+            9..=16 => (128, 16, 8, 4),
+            17..=32 => (64, 32, 8, 4),
             _ => (64, 64, 8, 8),
         };
         Tile { m, n, k: deep, own_m, own_n }
@@ -84,14 +84,17 @@ fn place(e: &mut Emit, own: Value, i: u32, across: u32, extra: u32) -> Value {
     e.b.add(at, extra)
 }
 
+/// Loads four neighbours, given k and the position in the tile of the first.
+pub(super) type LoadFour<'a> = &'a mut dyn FnMut(&mut Emit, Value, Value) -> Value;
+
 /// Emits the product over `from..to` of k. `a` and `b` load four neighbours: given k and the position in the tile of the
 /// first. Terms beyond `to` must come as zeros from `a`.
 pub(super) fn multiply(
     e: &mut Emit,
     tile: Tile,
     (from, to): (Value, Value),
-    (a, a_along): (&mut dyn FnMut(&mut Emit, Value, Value) -> Value, Along),
-    (b, b_along): (&mut dyn FnMut(&mut Emit, Value, Value) -> Value, Along),
+    (a, a_along): (LoadFour, Along),
+    (b, b_along): (LoadFour, Along),
 ) -> Block {
     // A line of padding keeps the columns of a tile in different banks.
     let (a_line, b_line) = (tile.m / 4 + 1, tile.n / 4 + 1);
