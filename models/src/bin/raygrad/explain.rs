@@ -91,7 +91,9 @@ pub fn run(args: &ExplainArgs) -> anyhow::Result<ExitCode> {
 #[cfg(feature = "wgpu")]
 fn kernels(program: &Program, artefact: Artefact) -> anyhow::Result<Vec<(String, Vec<u8>)>> {
     use raygrad_kernels::gpu::{Inputs, Limits, lower};
-    let lowered = lower(program, &mut Inputs::default(), &Limits::default())?;
+    // No adapter is asked: what a given one cannot bind is refused when the program is loaded onto it.
+    let limits = Limits { max_binding: u64::MAX, ..Limits::default() };
+    let lowered = lower(program, &mut Inputs::default(), &limits)?;
     let mut files = vec![];
     for (i, kernel) in lowered.launches.iter().flat_map(|l| &l.kernels).enumerate() {
         let name: String = kernel.name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect();
