@@ -4,11 +4,32 @@ use crate::worst;
 use raygrad_compiler::reference::{Array, Bindings, Data, evaluate};
 use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Step, compile};
-use raygrad_runtime::{Device, ProgramId, Session};
+use raygrad_runtime::{Device, DeviceError, ProgramId, Session};
 
 /// Every device that tests run on.
 pub fn devices() -> Vec<Device> {
-    vec![Device::cpu(Some(2)).unwrap_or_else(|e| panic!("{e}"))]
+    let cpu = Device::cpu(Some(2)).unwrap_or_else(|e| panic!("{e}"));
+    std::iter::once(cpu).chain(gpu()).collect()
+}
+
+/// The devices for tests that compile a hundred kernels or more: on a software driver that takes minutes, so a GPU joins
+/// only where `RAYGRAD_NIGHTLY=1`.
+pub fn devices_for_large_programs() -> Vec<Device> {
+    let nightly = std::env::var_os("RAYGRAD_NIGHTLY").is_some_and(|v| v == "1");
+    devices().into_iter().take(if nightly { usize::MAX } else { 1 }).collect()
+}
+
+/// The best adapter, which may be software; `None` only where `RAYGRAD_NO_GPU=1` says that there is none.
+pub fn gpu() -> Option<Device> {
+    match Device::wgpu(None) {
+        Ok(device) => Some(device),
+        Err(DeviceError::NotBuilt) => None,
+        Err(e) if std::env::var_os("RAYGRAD_NO_GPU").is_some_and(|v| v == "1") => {
+            println!("skipped, RAYGRAD_NO_GPU is set: {e}");
+            None
+        }
+        Err(e) => panic!("{e}; install a Vulkan driver (mesa-vulkan-drivers), or set RAYGRAD_NO_GPU=1 to skip"),
+    }
 }
 
 /// A session with one program, its inputs bound.

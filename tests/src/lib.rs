@@ -2,8 +2,11 @@
 
 pub mod backend;
 pub mod check;
+pub mod forms;
 pub mod graphs;
+pub mod mistakes;
 pub mod plan;
+pub mod planar;
 pub mod vectors;
 
 use raygrad_compiler::autodiff::grad;

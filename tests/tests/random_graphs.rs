@@ -56,7 +56,11 @@ fn check_graphs(part: u64, parts: u64) {
     }));
     for seed in seeds(part, parts) {
         let recipe = Recipe::new(seed);
-        if failure(&devices, &recipe).is_some() {
+        if let Some(text) = failure(&devices, &recipe) {
+            if catch_unwind(|| recipe.build()).is_err() {
+                failures.push(format!("the generator itself fails on {recipe:?}: {text}"));
+                break;
+            }
             let small = shrink(&recipe, |r| failure(&devices, r).is_some());
             let text = failure(&devices, &small).unwrap_or_default();
             let nodes = raygrad_compiler::graph::topological(small.build().step.roots());
