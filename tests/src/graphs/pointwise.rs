@@ -1,7 +1,7 @@
 //! Pointwise ops, choices and integers.
 
 use super::builder::{Builder, Float, Value};
-use raygrad_compiler::graph::{Axes, Channels, Shape, Tensor};
+use raygrad_compiler::graph::{Axes, Shape, Tensor};
 use raygrad_compiler::ops::custom::custom_adjoint;
 use raygrad_compiler::ops::random;
 use raygrad_compiler::reference::Array;
@@ -68,8 +68,7 @@ impl Builder {
             0 | 1 => off.relu(),
             2 => off.abs(),
             3 | 4 => {
-                let single = |f: &Float| f.t.channels() == Channels::Vector(1);
-                let y = self.float_where(|f| f.unit.is_some_and(|u| u >= unit) && single(f))?;
+                let y = self.float_where(|f| f.unit.is_some_and(|u| u >= unit) && f.t.width() == 1)?;
                 let both = if self.rng.chance(0.5) { off.min(&y.t) } else { off.max(&y.t) };
                 return self.result(both, bound.max(y.bound), half);
             }
