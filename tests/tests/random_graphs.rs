@@ -32,7 +32,7 @@ fn failure(devices: &[Device], recipe: &Recipe) -> Option<String> {
             Err(StepError::Empty) => return Ok(()),
             checked => checked.map_err(|e| e.to_string())?,
         }
-        check(devices_for_large_programs, &graph.step, &graph.bindings)?;
+        check(devices, &graph.step, &graph.bindings)?;
         let threads = [1, 2].map(|n| Device::cpu(Some(n)).expect("starts threads"));
         same_bits(&threads[0], &threads[1], &graph.step, &graph.bindings)
     };
@@ -56,9 +56,9 @@ fn check_graphs(part: u64, parts: u64) {
     }));
     for seed in seeds(part, parts) {
         let recipe = Recipe::new(seed);
-        if failure(&devices_for_large_programs, &recipe).is_some() {
-            let small = shrink(&recipe, |r| failure(&devices_for_large_programs, r).is_some());
-            let text = failure(&devices_for_large_programs, &small).unwrap_or_default();
+        if failure(&devices, &recipe).is_some() {
+            let small = shrink(&recipe, |r| failure(&devices, r).is_some());
+            let text = failure(&devices, &small).unwrap_or_default();
             let nodes = raygrad_compiler::graph::topological(small.build().step.roots());
             let nodes: Vec<String> = nodes.iter().map(|t| format!("{t:?}")).collect();
             failures.push(format!("{small:?}\n{}\n{text}", nodes.join("\n")));
