@@ -71,7 +71,7 @@ impl Planar {
                 (GRID, _) => self.model.grid.crop_points().concat(),
                 (TARGET, _) => self.colours(),
                 ("warp.truth", _) => {
-                    let entry = |i: usize| if i % 9 % 4 == 0 { 1.0 } else { 0.0 } + rng.uniform(-0.1, 0.1);
+                    let entry = |i: usize| if (i % 9).is_multiple_of(4) { 1.0 } else { 0.0 } + rng.uniform(-0.1, 0.1);
                     (0..lanes).map(entry).collect()
                 }
                 (_, Role::Parameter) => self.initial(&input.name, lanes, &mut rng),
