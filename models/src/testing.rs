@@ -58,20 +58,26 @@ impl Bench {
     fn new(warp: &dyn Warp) -> Result<Bench, TestError> {
         let (frame, point) = (Axis::new("frame", FRAMES), Axis::new("point", POINTS));
         let xy = Tensor::parameter("points", Shape::new(&[&frame, &point], 2));
-        let at = Points { frame: frame.clone(), point: point.clone(), xy: xy.clone() };
+        let planar = Points::planar(frame.clone(), point.clone(), xy.clone());
+        let (at, expected) = if warp.dof() == Dof::Pose {
+            let end = Axis::new("end", 2);
+            let shape = Shape::new(&[&frame, &point, &end], 3);
+            let position = Tensor::parameter("positions", shape.clone());
+            (Points { position, end: Some(end), ..planar }, shape)
+        } else {
+            (planar, xy.shape().clone())
+        };
         let code = codes(warp, &frame);
         let none = Tensor::scalar(0.0);
         let found = Registration::new(warp, &at, code.as_ref().map_or(&none, |c| &c.tensor), false);
-        let expected = Shape::new(&[&frame, &point], 2);
         if found.local.error().is_none() && *found.local.shape() != expected {
             return Err(TestError::Shape { expected, found: found.local.shape().clone() });
         }
         let mut random = Random::new(0, "testing");
         let mut bindings = Bindings::new();
         let upstream = Tensor::data("upstream", expected);
-        let mut scalar = (&found.local * upstream).sum_channels().sum(&[&frame, &point]);
-        // The other fits are constants to the derivative, which is exact for the first order alone, see `warps::fit`.
-        if let Some(residual) = found.residual.as_ref().filter(|_| warp.dof() == Dof::Homography) {
+        let mut scalar = (&found.local * upstream).sum_channels().sum_over(found.local.axes());
+        if let Some(residual) = &found.residual {
             scalar = scalar + residual;
         }
         for t in topological([scalar.clone()]) {
@@ -90,7 +96,16 @@ impl Bench {
             bindings
                 .insert(p.tensor.input_name().unwrap_or_default().to_string(), Array::floats(p.tensor.shape(), values));
         }
-        let inputs = [xy].into_iter().chain(parameters.into_iter().map(|p| p.tensor)).collect();
+        // A warp that does not look where on the sensor a point lies has nothing to say about `points` in 3D.
+        let used = |t: &Tensor| bindings.contains_key(t.input_name().unwrap_or_default());
+        let points = [xy, at.position].into_iter().filter(used);
+        let mut inputs: Vec<Tensor> = vec![];
+        points.for_each(|t| {
+            if !inputs.iter().any(|known| known.id() == t.id()) {
+                inputs.push(t)
+            }
+        });
+        let inputs = inputs.into_iter().chain(parameters.into_iter().map(|p| p.tensor)).collect();
         Ok(Bench { scalar, local: found.local, inputs, bindings })
     }
 
@@ -183,7 +198,7 @@ pub fn check_gradients(warp: &dyn Warp) -> Result<(), TestError> {
 pub fn kernels(warp: &dyn Warp) -> Result<String, TestError> {
     let mut bench = Bench::new(warp)?;
     // Data in training, so no gradient goes there.
-    bench.inputs.retain(|t| t.input_name() != Some("points"));
+    bench.inputs.retain(|t| !matches!(t.input_name(), Some("points" | "positions")));
     let step = bench.step();
     let (cpu, gpu) = (compile(&step, &Target::cpu())?, compile(&step, &Target::gpu())?);
     Ok(format!("cpu\n{cpu}\ngpu\n{gpu}\n{}", wgsl(&gpu)?))

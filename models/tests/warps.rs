@@ -4,7 +4,7 @@ use raygrad::config::{Dof, Layered};
 use raygrad::testing::check_gradients;
 use raygrad::warps::{GlobalWarp, LocalWarp};
 
-const ALL: [Dof; 4] = [Dof::Rotation, Dof::Translation, Dof::Rigid, Dof::Homography];
+const ALL: [Dof; 5] = [Dof::Rotation, Dof::Translation, Dof::Rigid, Dof::Pose, Dof::Homography];
 
 #[test]
 fn global_warps() {
@@ -16,7 +16,7 @@ fn global_warps() {
 #[test]
 fn local_warps() {
     // The local group differs from the global one only for the last.
-    for dof in [Dof::Rigid, Dof::Homography] {
+    for dof in [Dof::Rigid, Dof::Pose, Dof::Homography] {
         let mut layered = Layered::load("planar-l2g").unwrap();
         for set in ["warp.code=4", "warp.layers=[8,8,8]", "warp.skip=[2]", "warp.solver=eigen"] {
             layered.set(set).unwrap();

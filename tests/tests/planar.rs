@@ -73,12 +73,8 @@ fn check_model(planar: &Planar, devices: &[Device]) {
         check_slope(&format!("{name}, {}", along[0].0), &loss, &bindings, &along, found);
     }
 
-    // Fits other than homographies are constants to the derivative: exact for the first order alone (see `warps::fit`).
-    let fitted = planar.model.settings.warp.method == raygrad::config::Method::Local
-        && planar.model.settings.warp.dof != raygrad::config::Dof::Homography;
-    let smooth = if fitted { output(&step, "render") } else { loss };
     let along = direction(&parameters, &mut rng);
-    let slope = slope(&grad(&smooth, &wanted), &along, &mut bindings);
+    let slope = slope(&grad(&loss, &wanted), &along, &mut bindings);
     let second = grad(&slope, &wanted);
     let values = evaluate(&second, &bindings).unwrap_or_else(|e| panic!("{name}: {e}"));
     let other = direction(&parameters, &mut rng);

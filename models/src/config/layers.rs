@@ -289,7 +289,8 @@ mod tests {
         );
         assert!(error(l.set("points_per_patch=3")).contains("did you mean `data.points_per_patch`?"));
         assert!(
-            error(l.set("warp.dof=4")).contains("expected 1 (rotation), 2 (translation), 3 (rigid) or 8 (homography)")
+            error(l.set("warp.dof=4"))
+                .contains("expected 1 (rotation), 2 (translation), 3 (rigid), 6 (pose) or 8 (homography)")
         );
         assert!(error(l.set("optim.lr=fast")).contains("`optim.lr`: invalid type: string \"fast\", expected a number"));
         assert!(error(l.set("steps")).contains("section.key=value"));

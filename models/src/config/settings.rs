@@ -125,6 +125,8 @@ pub enum Dof {
     Rotation,
     Translation,
     Rigid,
+    /// A rigid motion of space.
+    Pose,
     Homography,
 }
 
@@ -134,6 +136,7 @@ impl Dof {
             Dof::Rotation => 1,
             Dof::Translation => 2,
             Dof::Rigid => 3,
+            Dof::Pose => 6,
             Dof::Homography => 8,
         }
     }
@@ -151,8 +154,11 @@ impl TryFrom<u64> for Dof {
             1 => Ok(Dof::Rotation),
             2 => Ok(Dof::Translation),
             3 => Ok(Dof::Rigid),
+            6 => Ok(Dof::Pose),
             8 => Ok(Dof::Homography),
-            _ => Err(format!("expected 1 (rotation), 2 (translation), 3 (rigid) or 8 (homography), found {n}")),
+            _ => {
+                Err(format!("expected 1 (rotation), 2 (translation), 3 (rigid), 6 (pose) or 8 (homography), found {n}"))
+            }
         }
     }
 }
@@ -162,6 +168,7 @@ impl fmt::Display for Dof {
             Dof::Rotation => "rotation",
             Dof::Translation => "translation",
             Dof::Rigid => "rigid",
+            Dof::Pose => "pose",
             Dof::Homography => "homography",
         })
     }

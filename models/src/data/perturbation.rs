@@ -187,7 +187,7 @@ fn draw_l2g(settings: &Settings, random: &mut Random) -> One {
         Dof::Rotation => One { rotation, ..One::default() },
         Dof::Translation => One { translation, ..One::default() },
         Dof::Rigid => One { rotation, translation, ..One::default() },
-        Dof::Homography => One { homography, rotation, translation },
+        Dof::Homography | Dof::Pose => One { homography, rotation, translation },
     }
 }
 
@@ -200,7 +200,7 @@ fn draw_barf(settings: &Settings, patch: usize, random: &mut Random) -> One {
     let [h1, h2, h3, h4, ..] = homography;
     // Smaller groups keep the part of the draw that they can express.
     match settings.warp.dof {
-        Dof::Homography => One { homography, ..One::default() },
+        Dof::Homography | Dof::Pose => One { homography, ..One::default() },
         Dof::Rigid => One { rotation: (h4 - h3) / 2.0, translation: [h1, h2], ..One::default() },
         Dof::Translation => One { translation: [h1, h2], ..One::default() },
         Dof::Rotation => One { rotation: (h4 - h3) / 2.0, ..One::default() },

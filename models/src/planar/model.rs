@@ -144,7 +144,7 @@ impl PlanarModel {
     #[track_caller]
     fn all_points(&self) -> Points {
         let xy = Tensor::data(GRID, Shape::new(&[&self.pixel], 2));
-        Points { frame: self.frame.clone(), point: self.pixel.clone(), xy }
+        Points::planar(self.frame.clone(), self.pixel.clone(), xy)
     }
 
     #[track_caller]
@@ -165,7 +165,7 @@ impl PlanarModel {
         let index = position.clamp(0.0, pixels - 1.0).to_u32();
         let all = self.all_points();
         let xy = all.xy.take(&index, &self.pixel);
-        (Points { frame: all.frame, point, xy }, self.target().take(&index, &self.pixel))
+        (Points::planar(all.frame, point, xy), self.target().take(&index, &self.pixel))
     }
 
     /// Adam on every parameter; field and warp have learning rates of their own.

@@ -5,13 +5,14 @@
 //! | 1 | angle | rotation about the origin |
 //! | 2 | (t_x, t_y) | translation |
 //! | 3 | (u_x, u_y, angle) | SE(2) exponential |
+//! | 6 | twist, rotation first | SE(3) exponential, from field to sensor |
 //! | 8 | h1 .. h8 | SL(3) exponential |
 
 use super::fit::affine;
 use super::{Points, Warp};
 use crate::config::Dof;
-use raygrad_compiler::functions::lie::{se2_exp, sl3_exp, so2_exp};
-use raygrad_compiler::functions::matrix::{apply, apply_affine, apply_homography};
+use raygrad_compiler::functions::lie::{se2_exp, se3_exp, sl3_exp, so2_exp};
+use raygrad_compiler::functions::matrix::{apply, apply_affine, apply_homography, invert_pose};
 use raygrad_compiler::functions::mlp::Init;
 use raygrad_compiler::{Axis, Tensor};
 
@@ -23,7 +24,7 @@ pub struct GlobalWarp {
 
 impl Warp for GlobalWarp {
     fn map(&self, at: &Points, code: &Tensor) -> Tensor {
-        move_points(self.dof, code, &at.xy)
+        move_points(self.dof, code, &at.position)
     }
     fn code_width(&self) -> usize {
         self.dof.count()
@@ -36,6 +37,7 @@ impl Warp for GlobalWarp {
             Dof::Rotation => so2_exp(code),
             Dof::Translation => code.clone(),
             Dof::Rigid => se2_exp(code),
+            Dof::Pose => se3_exp(code),
             Dof::Homography => sl3_exp(code),
         };
         Some(affine(&part, self.dof))
@@ -48,13 +50,14 @@ impl Warp for GlobalWarp {
     }
 }
 
-/// `points` under the transform whose coordinates are the channels of `code`.
+/// Sensor `points` in the field, under the transform whose coordinates are the channels of `code`.
 #[track_caller]
 pub(super) fn move_points(dof: Dof, code: &Tensor, points: &Tensor) -> Tensor {
     match dof {
         Dof::Rotation => apply(&so2_exp(code), points),
         Dof::Translation => points + code,
         Dof::Rigid => apply_affine(&se2_exp(code), points),
+        Dof::Pose => apply_affine(&invert_pose(&se3_exp(code)), points),
         Dof::Homography => apply_homography(&sl3_exp(code), points),
     }
 }

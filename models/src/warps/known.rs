@@ -13,7 +13,7 @@ pub struct KnownWarp;
 
 impl Warp for KnownWarp {
     fn map(&self, at: &Points, _: &Tensor) -> Tensor {
-        apply_homography(&truth(&at.frame), &at.xy)
+        apply_homography(&truth(&at.frame), &at.position)
     }
     fn global(&self, frame: &Axis, _: &Tensor) -> Option<Tensor> {
         Some(truth(frame))

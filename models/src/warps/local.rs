@@ -1,7 +1,7 @@
 //! One transform a point, from a network that sees the point and the frame's code (L2G-NeRF, CVPR 2023).
 //!
 //! (u, theta) = MLP([x, e]), y = Exp(u, theta) x. Where the global transform is a homography, each point still moves
-//! rigidly; for translations and rotations it moves by one of those.
+//! rigidly; for translations and rotations it moves by one of those. In 3D the motion of a ray is a twist.
 
 use super::global::move_points;
 use super::{Points, Warp};
@@ -40,7 +40,7 @@ fn local_group(global: Dof) -> Dof {
 impl Warp for LocalWarp {
     fn map(&self, at: &Points, code: &Tensor) -> Tensor {
         let motion = self.network.apply(&concat([&at.xy, code]));
-        move_points(local_group(self.global), &motion, &at.xy)
+        move_points(local_group(self.global), &motion, &at.position)
     }
     fn code_width(&self) -> usize {
         self.code

@@ -10,28 +10,41 @@ mod known;
 mod local;
 
 pub use fit::fit_global;
+use fit::move_by;
 pub use global::GlobalWarp;
 pub use known::{KnownWarp, TRUTH as KNOWN_TRUTH};
 pub use local::LocalWarp;
 
 use crate::config::{Dof, Method, Settings, Solver};
-use raygrad_compiler::functions::loss::mean_squared_error;
-use raygrad_compiler::functions::matrix::apply_homography;
 use raygrad_compiler::functions::mlp::{Init, Parameter};
-use raygrad_compiler::{Axis, Shape, Tensor};
+use raygrad_compiler::{Axes, Axis, Shape, Tensor};
 use std::fmt::Debug;
 use std::sync::Arc;
 
-/// Sensor points of every frame.
+/// Sensor points of every frame: the pixels of a picture, or in 3D the rays of a camera, each given by two points.
 #[derive(Clone, Debug)]
 pub struct Points {
     pub frame: Axis,
     pub point: Axis,
-    /// Two channels along `point`, and along `frame` if the frames have different points.
+    /// Where on the sensor: two channels along `point`, and along `frame` if the frames have different points.
     pub xy: Tensor,
+    /// What is mapped: `xy` itself, or in 3D three channels along `end` too, in the frame's rough guess of world space.
+    pub position: Tensor,
+    /// In 3D, which point of a ray: 0 its pixel at unit depth, 1 the camera's centre.
+    pub end: Option<Axis>,
 }
 
 impl Points {
+    /// Points of a picture.
+    pub fn planar(frame: Axis, point: Axis, xy: Tensor) -> Points {
+        Points { frame, point, position: xy.clone(), xy, end: None }
+    }
+
+    /// The axes that the points of one frame lie along.
+    pub fn within_frame(&self) -> Axes {
+        Axes::new([self.point.clone()].into_iter().chain(self.end.clone()))
+    }
+
     #[track_caller]
     pub fn x(&self) -> Tensor {
         self.xy.ch(0)
@@ -44,7 +57,7 @@ impl Points {
 
 /// A map of sensor points to field points.
 pub trait Warp: Debug + Send + Sync {
-    /// Field points of all `at`: two channels along frame and point. `code` has [`Warp::code_width`] channels a frame.
+    /// Field points of all `at.position`, as many channels. `code` has [`Warp::code_width`] channels a frame.
     fn map(&self, at: &Points, code: &Tensor) -> Tensor;
 
     /// Channels of the trained code of a frame; 0 for none.
@@ -62,7 +75,8 @@ pub trait Warp: Debug + Send + Sync {
         vec![]
     }
 
-    /// The `(3, 3)` transform of each frame, where the map is nothing but that. By default it is fitted to the map.
+    /// The transform of each frame (see [`Registration::transform`]), where the map is nothing but that. By default it is
+    /// fitted to the map.
     fn global(&self, _frame: &Axis, _code: &Tensor) -> Option<Tensor> {
         None
     }
@@ -99,7 +113,8 @@ pub fn of_settings(settings: &Settings) -> Arc<dyn Warp> {
 pub struct Registration {
     /// Field points of the map.
     pub local: Tensor,
-    /// One `(3, 3)` transform a frame.
+    /// One transform a frame: `(3, 3)` from sensor to field; in 3D the pose `(3, 4)` that takes field points back to
+    /// `at.position`, so that a frame's own pose is its rough guess after this one.
     pub transform: Tensor,
     /// Field points under the global transform.
     pub global: Tensor,
@@ -114,13 +129,13 @@ impl Registration {
         let first = Tensor::index(&at.frame).equal(&Tensor::integers(&[0]));
         let held = pinned && !warp.zero_code_is_identity();
         let mapped = warp.map(at, code);
-        let local = if held { first.select(&at.xy, &mapped) } else { mapped };
+        let local = if held { first.select(&at.position, &mapped) } else { mapped };
         match warp.global(&at.frame, code) {
             Some(transform) => Registration { global: local.clone(), local, transform, residual: None },
             None => {
                 let transform = fit_global(warp.dof(), warp.solver(), at, &local, held.then_some(&first));
-                let global = apply_homography(&transform, &at.xy);
-                let residual = Some(mean_squared_error(&local, &global));
+                let global = move_by(warp.dof(), &transform, &at.position);
+                let residual = Some(fit::residual(warp.dof(), &transform, &at.position, &local, &global));
                 Registration { local, transform, global, residual }
             }
         }
