@@ -60,16 +60,18 @@ impl Bench {
         let xy = Tensor::parameter("points", Shape::new(&[&frame, &point], 2));
         let planar = Points::planar(frame.clone(), point.clone(), xy.clone());
         let (at, expected) = if warp.dof() == Dof::Pose {
-            let end = Axis::new("end", 2);
-            let shape = Shape::new(&[&frame, &point, &end], 3);
+            let shape = Shape::new(&[&frame, &point], 3);
             let position = Tensor::parameter("positions", shape.clone());
-            (Points { position, end: Some(end), ..planar }, shape)
+            (Points { position, ..planar }, shape)
         } else {
             (planar, xy.shape().clone())
         };
+        // The rays of a frame end in its camera's centre.
+        let position = Tensor::parameter("centers", Shape::new(&[&frame], 3));
+        let centers = (warp.dof() == Dof::Pose).then(|| Points { position, first: POINTS, ..at.clone() });
         let code = codes(warp, &frame);
         let none = Tensor::scalar(0.0);
-        let found = Registration::new(warp, &at, code.as_ref().map_or(&none, |c| &c.tensor), false);
+        let found = Registration::new(warp, &at, centers.as_ref(), code.as_ref().map_or(&none, |c| &c.tensor), false);
         if found.local.error().is_none() && *found.local.shape() != expected {
             return Err(TestError::Shape { expected, found: found.local.shape().clone() });
         }
@@ -79,6 +81,9 @@ impl Bench {
         let mut scalar = (&found.local * upstream).sum_channels().sum_over(found.local.axes());
         if let Some(residual) = &found.residual {
             scalar = scalar + residual;
+        }
+        if let Some(centers) = &found.centers {
+            scalar = scalar + centers.sin().sum_channels().sum_over(centers.axes());
         }
         for t in topological([scalar.clone()]) {
             let Some(Input { name, shape, .. }) = t.op_as::<Input>() else { continue };
@@ -98,7 +103,7 @@ impl Bench {
         }
         // A warp that does not look where on the sensor a point lies has nothing to say about `points` in 3D.
         let used = |t: &Tensor| bindings.contains_key(t.input_name().unwrap_or_default());
-        let points = [xy, at.position].into_iter().filter(used);
+        let points = [xy, at.position].into_iter().chain(centers.map(|c| c.position)).filter(used);
         let mut inputs: Vec<Tensor> = vec![];
         points.for_each(|t| {
             if !inputs.iter().any(|known| known.id() == t.id()) {
@@ -198,7 +203,7 @@ pub fn check_gradients(warp: &dyn Warp) -> Result<(), TestError> {
 pub fn kernels(warp: &dyn Warp) -> Result<String, TestError> {
     let mut bench = Bench::new(warp)?;
     // Data in training, so no gradient goes there.
-    bench.inputs.retain(|t| !matches!(t.input_name(), Some("points" | "positions")));
+    bench.inputs.retain(|t| !matches!(t.input_name(), Some("points" | "positions" | "centers")));
     let step = bench.step();
     let (cpu, gpu) = (compile(&step, &Target::cpu())?, compile(&step, &Target::gpu())?);
     Ok(format!("cpu\n{cpu}\ngpu\n{gpu}\n{}", wgsl(&gpu)?))

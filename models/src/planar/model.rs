@@ -138,7 +138,7 @@ impl PlanarModel {
     fn register(&self, at: &Points) -> Registration {
         let none = Tensor::scalar(0.0);
         let code = self.code.as_ref().map_or(&none, |c| &c.tensor);
-        Registration::new(&*self.warp, at, code, self.settings.warp.fix_first)
+        Registration::new(&*self.warp, at, None, code, self.settings.warp.fix_first)
     }
 
     #[track_caller]

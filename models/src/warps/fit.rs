@@ -14,24 +14,31 @@
 
 use super::Points;
 use crate::config::{Dof, Solver};
-use raygrad_compiler::Tensor;
 use raygrad_compiler::functions::homography::{self, fit_homography};
 use raygrad_compiler::functions::loss::mean_squared_error;
 use raygrad_compiler::functions::matrix::{apply, apply_affine, apply_homography, invert_pose, split_pose};
 use raygrad_compiler::functions::rigid_fit::{fit_rigid_2d, fit_rigid_3d, fit_rotation_2d, fit_translation};
 use raygrad_compiler::ops::custom::custom_adjoint;
 use raygrad_compiler::ops::pick::concat;
+use raygrad_compiler::{Axes, Tensor};
 
-/// One transform a frame that takes the points `at` to `mapped`, or in 3D the pose that takes `mapped` to `at`. `identity`
-/// marks frames whose two point sets are the same: their homography is the identity, and the singular system is not solved.
+/// One transform a frame that takes points to what they are `mapped` to, or in 3D the pose back. Only 3D fits take more
+/// than one set of points. `identity` marks frames whose two point sets are the same: their homography is the identity, and
+/// the singular system is not solved.
 #[track_caller]
-pub fn fit_global(dof: Dof, solver: Solver, at: &Points, mapped: &Tensor, identity: Option<&Tensor>) -> Tensor {
-    let (over, from) = (at.within_frame(), &at.position);
+pub fn fit_global(dof: Dof, solver: Solver, pairs: &[(&Points, &Tensor)], identity: Option<&Tensor>) -> Tensor {
+    let [(at, mapped), ..] = pairs else {
+        return Tensor::misfit("fit_global", &[], "no points", "give at least one set of points");
+    };
+    let (over, from) = (Axes::new([at.point.clone()]), &at.position);
     match dof {
         Dof::Rotation => affine(&fit_rotation_2d(from, mapped, &over), dof),
         Dof::Translation => affine(&fit_translation(from, mapped, &over), dof),
         Dof::Rigid => affine(&fit_rigid_2d(from, mapped, &over), dof),
-        Dof::Pose => fit_rigid_3d(&[(mapped, from)], &over),
+        Dof::Pose => {
+            let back: Vec<(&Tensor, &Tensor)> = pairs.iter().map(|(at, mapped)| (*mapped, &at.position)).collect();
+            fit_rigid_3d(&back, &over)
+        }
         Dof::Homography => {
             let solver = match solver {
                 Solver::InverseIteration => homography::Solver::InverseIteration,
@@ -67,9 +74,9 @@ pub(super) fn move_by(dof: Dof, transform: &Tensor, points: &Tensor) -> Tensor {
     }
 }
 
-/// Mean of `(local - global)^2` over frames, points and coordinates, with `global` the `points` under the fitted transform.
+/// Mean of `(local - global)^2` over frames, points and coordinates, with `global` the points `at` under the fitted transform.
 #[track_caller]
-pub(super) fn residual(dof: Dof, transform: &Tensor, points: &Tensor, local: &Tensor, global: &Tensor) -> Tensor {
+pub(super) fn residual(dof: Dof, transform: &Tensor, at: &Points, local: &Tensor, global: &Tensor) -> Tensor {
     let value = mean_squared_error(local, global);
     let linear = match dof {
         Dof::Homography => return value,
@@ -78,7 +85,7 @@ pub(super) fn residual(dof: Dof, transform: &Tensor, points: &Tensor, local: &Te
     };
     let share = 2.0 / (local.axes().union(global.axes()).elements() * local.width()) as f64;
     let apart = (local - global) * share;
-    custom_adjoint(&value, &[local, points], move |_, upstream| {
+    custom_adjoint(&value, &[local, &at.position], move |_, upstream| {
         vec![Some(&apart * upstream), Some(-apply(&linear.transpose(), &apart) * upstream)]
     })
 }

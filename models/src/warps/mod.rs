@@ -17,32 +17,28 @@ pub use local::LocalWarp;
 
 use crate::config::{Dof, Method, Settings, Solver};
 use raygrad_compiler::functions::mlp::{Init, Parameter};
-use raygrad_compiler::{Axes, Axis, Shape, Tensor};
+use raygrad_compiler::{Axis, Shape, Tensor};
 use std::fmt::Debug;
 use std::sync::Arc;
 
-/// Sensor points of every frame: the pixels of a picture, or in 3D the rays of a camera, each given by two points.
+/// Sensor points of every frame: pixels of a picture, or in 3D either end of a camera's rays.
 #[derive(Clone, Debug)]
 pub struct Points {
     pub frame: Axis,
     pub point: Axis,
     /// Where on the sensor: two channels along `point`, and along `frame` if the frames have different points.
     pub xy: Tensor,
-    /// What is mapped: `xy` itself, or in 3D three channels along `end` too, in the frame's rough guess of world space.
+    /// What is mapped: `xy` itself; in 3D three channels, the pixel at unit depth or the camera's centre, where the frame's
+    /// rough guess of its pose puts them.
     pub position: Tensor,
-    /// In 3D, which point of a ray: 0 its pixel at unit depth, 1 the camera's centre.
-    pub end: Option<Axis>,
+    /// How many points of the same frame come before these: the camera centres follow the pixels.
+    pub first: usize,
 }
 
 impl Points {
     /// Points of a picture.
     pub fn planar(frame: Axis, point: Axis, xy: Tensor) -> Points {
-        Points { frame, point, position: xy.clone(), xy, end: None }
-    }
-
-    /// The axes that the points of one frame lie along.
-    pub fn within_frame(&self) -> Axes {
-        Axes::new([self.point.clone()].into_iter().chain(self.end.clone()))
+        Points { frame, point, position: xy.clone(), xy, first: 0 }
     }
 
     #[track_caller]
@@ -118,27 +114,39 @@ pub struct Registration {
     pub transform: Tensor,
     /// Field points under the global transform.
     pub global: Tensor,
-    /// Mean of (local - global)^2 over frames, points and coordinates; none where the map is the global transform.
+    /// In 3D, where the camera centres of the same rays are mapped.
+    pub centers: Option<Tensor>,
+    /// Mean of (local - global)^2 over frames, points (in 3D pixels and centres) and coordinates; none where the map is the
+    /// global transform.
     pub residual: Option<Tensor>,
 }
 
 impl Registration {
-    /// Applies `warp`; `pinned` says whether the first frame is the gauge.
+    /// Applies `warp` to pixels `at` and, in 3D, to the camera centres of the same rays; `pinned` says whether the first
+    /// frame is the gauge.
     #[track_caller]
-    pub fn new(warp: &dyn Warp, at: &Points, code: &Tensor, pinned: bool) -> Registration {
+    pub fn new(warp: &dyn Warp, at: &Points, centers: Option<&Points>, code: &Tensor, pinned: bool) -> Registration {
         let first = Tensor::index(&at.frame).equal(&Tensor::integers(&[0]));
         let held = pinned && !warp.zero_code_is_identity();
-        let mapped = warp.map(at, code);
-        let local = if held { first.select(&at.position, &mapped) } else { mapped };
-        match warp.global(&at.frame, code) {
-            Some(transform) => Registration { global: local.clone(), local, transform, residual: None },
-            None => {
-                let transform = fit_global(warp.dof(), warp.solver(), at, &local, held.then_some(&first));
-                let global = move_by(warp.dof(), &transform, &at.position);
-                let residual = Some(fit::residual(warp.dof(), &transform, &at.position, &local, &global));
-                Registration { local, transform, global, residual }
-            }
+        let map = |at: &Points| {
+            let mapped = warp.map(at, code);
+            if held { first.select(&at.position, &mapped) } else { mapped }
+        };
+        let (local, mapped_centers) = (map(at), centers.map(map));
+        if let Some(transform) = warp.global(&at.frame, code) {
+            let global = local.clone();
+            return Registration { local, transform, global, centers: mapped_centers, residual: None };
         }
+        let mut pairs = vec![(at, &local)];
+        pairs.extend(centers.zip(mapped_centers.as_ref()));
+        let transform = fit_global(warp.dof(), warp.solver(), &pairs, held.then_some(&first));
+        let global = move_by(warp.dof(), &transform, &at.position);
+        let mut residual = fit::residual(warp.dof(), &transform, at, &local, &global);
+        if let Some((at, local)) = pairs.get(1) {
+            let global = move_by(warp.dof(), &transform, &at.position);
+            residual = (residual + fit::residual(warp.dof(), &transform, at, local, &global)) * 0.5;
+        }
+        Registration { local, transform, global, centers: mapped_centers, residual: Some(residual) }
     }
 }
 
