@@ -88,14 +88,15 @@ fn compare(data: &Path, file: &Path) -> anyhow::Result<()> {
         if let (true, Some(point)) = (shown, point) {
             let (_, corner, psnr, patches) = point.values();
             let own = trainer.measure()?;
+            let Some(errors) = own.corners() else { return Ok(()) };
             table.row([
                 done.to_string(),
                 format!("{corner:.3}"),
                 format!("{psnr:.2}"),
                 per_patch(patches),
-                format!("{:.3}", own.corner_error_px.mean),
-                format!("{:.2}", own.patch_psnr_db),
-                per_patch(&own.corner_error_px.per_patch),
+                format!("{:.3}", errors.mean),
+                format!("{:.2}", own.psnr_db()),
+                per_patch(&errors.per_patch),
             ]);
         }
         Ok(())

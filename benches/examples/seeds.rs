@@ -58,9 +58,10 @@ fn main() -> anyhow::Result<()> {
             let same = perturbation.get_or_insert_with(|| data.perturbation.clone()) == &data.perturbation;
             ensure!(same, "the perturbation of seed {seed} depends on the method");
             let allowed = ALLOWED * data.grid.height.max(data.grid.width) as f64 / REFERENCE_SIDE;
-            let (corner, psnr) = (found.corner_error_px.mean, found.patch_psnr_db);
+            let errors = found.corners().context("not a planar preset")?;
+            let (corner, psnr) = (errors.mean, found.psnr_db());
             let run = Run { corner, psnr, seconds, success: corner <= allowed };
-            let per_patch: Vec<String> = found.corner_error_px.per_patch.iter().map(|e| format!("{e:.2}")).collect();
+            let per_patch: Vec<String> = errors.per_patch.iter().map(|e| format!("{e:.2}")).collect();
             eprintln!(
                 "\r{preset} seed {seed}: {corner:.3} px ({}), {psnr:.2} dB, {seconds:.0} s",
                 per_patch.join(", ")

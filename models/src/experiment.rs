@@ -4,7 +4,7 @@
 //! # fn main() -> Result<(), raygrad::Error> {
 //! use raygrad::Experiment;
 //! let outcome = Experiment::preset("planar-l2g-small")?.set("optim.steps=500")?.out("runs/first").train()?;
-//! println!("{} px", outcome.metrics.last.map_or(f64::NAN, |f| f.entry.corner_error_px.mean));
+//! println!("{}", outcome.metrics.last.map_or(String::new(), |f| f.entry.error_text()));
 //! # Ok(())
 //! # }
 //! ```
@@ -12,9 +12,10 @@
 use crate::Error;
 use crate::config::{ConfigError, DeviceChoice, Layered, Origin};
 use crate::planar::{PlanarData, Trainer};
+use crate::run::RunFolder;
 use crate::run::checkpoint::Checkpoint;
-use crate::run::metrics::{Entry, Final, Metrics};
-use crate::run::{RunFolder, results};
+use crate::run::metrics::{Entry, Metrics};
+use crate::training::Training;
 use crate::warps::{self, Warp};
 use raygrad_runtime::{Device, DeviceError};
 use std::path::{Path, PathBuf};
@@ -39,6 +40,8 @@ pub struct Outcome {
     pub folder: PathBuf,
     /// Whether it was stopped before its last step; it can be resumed.
     pub interrupted: bool,
+    /// The headline numbers of a finished run, as lines of text.
+    pub summary: String,
 }
 
 /// Told how a run gets on. Every method does nothing unless it is given.
@@ -113,7 +116,12 @@ impl Experiment {
         self.train_observed(&mut Quiet, &AtomicBool::new(false))
     }
 
-    /// Checks everything, compiles, and fills the device: a trainer before its first step.
+    /// Checks everything, compiles, and fills the device: an experiment before its first step.
+    pub fn training(&self) -> Result<Box<dyn Training>, Error> {
+        Ok(Box::new(self.trainer()?))
+    }
+
+    /// The same for a planar experiment.
     pub fn trainer(&self) -> Result<Trainer, Error> {
         self.layered.validate()?;
         let settings = &self.layered.settings;
@@ -136,36 +144,36 @@ impl Experiment {
             true => RunFolder::reopen(&path, settings)?,
             false => RunFolder::claim(&path, settings)?,
         };
-        let mut trainer = self.trainer()?;
+        let mut trainer = self.training()?;
         let mut run = Run { metrics: Metrics::default(), seconds: 0.0, begun: Instant::now() };
         if self.resume {
-            let checkpoint = Checkpoint::load(&path, &trainer.checkpoint_shapes())?;
+            let checkpoint = Checkpoint::load(&path, &trainer.learner().checkpoint_shapes())?;
             trainer.restore(&checkpoint)?;
             (run.metrics.steps, run.seconds) = (checkpoint.steps, checkpoint.seconds);
         } else {
             folder.start(settings)?;
-            results::write_data(&folder, settings, &trainer.data)?;
+            trainer.write_data(&folder)?;
         }
         folder.keep();
         run.begun = Instant::now();
         observer.begin(&path, trainer.steps_done(), settings.optim.steps);
-        let interrupted = self.run_steps(&mut run, &mut trainer, &folder, observer, stop)?;
+        let interrupted = self.run_steps(&mut run, &mut *trainer, &folder, observer, stop)?;
         if !interrupted {
             observer.finishing();
-            let evaluation = trainer.evaluate()?;
-            let warps = evaluation.warps.iter().map(|w| std::array::from_fn(|i| w.0[(i / 3, i % 3)])).collect();
-            run.metrics.last = Some(Final { entry: evaluation.entry.clone(), seconds: run.elapsed(), warps });
-            results::write_results(&folder, &self.layered, &mut trainer, &evaluation, &run.metrics)?;
+            let Run { metrics, seconds, begun } = &mut run;
+            let elapsed = || *seconds + begun.elapsed().as_secs_f64();
+            trainer.finish(&folder, &self.layered, metrics, &elapsed)?;
         }
+        let summary = run.metrics.last.as_ref().map_or(String::new(), |last| trainer.summary(last));
         folder.write("metrics.json", run.metrics.to_json().as_bytes())?;
-        Ok(Outcome { metrics: run.metrics, folder: path, interrupted })
+        Ok(Outcome { metrics: run.metrics, folder: path, interrupted, summary })
     }
 
     /// The steps that are left; whether they were cut short.
     fn run_steps(
         &self,
         run: &mut Run,
-        trainer: &mut Trainer,
+        trainer: &mut dyn Training,
         folder: &RunFolder,
         observer: &mut dyn Observer,
         stop: &AtomicBool,
@@ -173,7 +181,7 @@ impl Experiment {
         let (steps, every) = (self.layered.settings.optim.steps, &self.layered.settings.run);
         let due = |period: usize, done: usize| period > 0 && done.is_multiple_of(period);
         if trainer.steps_done() == 0 && every.picture_every > 0 {
-            results::write_frame(folder, trainer)?;
+            trainer.write_frame(folder)?;
         }
         while trainer.steps_done() < steps {
             if stop.load(Ordering::Relaxed) {
@@ -188,7 +196,7 @@ impl Experiment {
                 run.metrics.steps.push(entry);
             }
             if due(every.picture_every, done) {
-                results::write_frame(folder, trainer)?;
+                trainer.write_frame(folder)?;
             }
             if due(every.checkpoint_every, done) || done == steps {
                 run.checkpoint(trainer, folder)?;
@@ -211,7 +219,7 @@ impl Run {
     fn elapsed(&self) -> f64 {
         self.seconds + self.begun.elapsed().as_secs_f64()
     }
-    fn checkpoint(&self, trainer: &mut Trainer, folder: &RunFolder) -> Result<(), Error> {
+    fn checkpoint(&self, trainer: &mut dyn Training, folder: &RunFolder) -> Result<(), Error> {
         let (step, seconds, steps) = (trainer.steps_done(), self.elapsed(), self.metrics.steps.clone());
         Checkpoint { step, seconds, steps, tensors: trainer.tensors()? }.save(folder.path())?;
         Ok(())

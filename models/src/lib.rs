@@ -37,9 +37,11 @@ pub mod fields;
 pub mod geometry;
 pub mod pictures;
 pub mod planar;
+pub mod radiance;
 pub mod report;
 pub mod run;
 pub mod testing;
+pub mod training;
 pub mod warps;
 
 pub use error::Error;

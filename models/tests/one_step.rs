@@ -4,7 +4,8 @@
 use raygrad::config::{Layered, Settings};
 use raygrad::data::{Perturbation, Photo};
 use raygrad::geometry::{Grid, Transform};
-use raygrad::planar::{PlanarData, PlanarModel, Rates, model};
+use raygrad::planar::{PlanarData, PlanarModel, model};
+use raygrad::training::Rates;
 use raygrad::warps;
 use raygrad_compiler::Step;
 use raygrad_compiler::graph::topological;
@@ -166,8 +167,7 @@ fn check(case: &Value) {
         if it == 0 {
             rates.progress = input["progress_first_iteration"].as_f64().unwrap();
         }
-        let values = [rates.progress, rates.lr_field, rates.lr_warp, rates.bias1, rates.bias2];
-        for ((key, _), value) in rates.inputs().iter().zip(values) {
+        for (key, value) in rates.inputs() {
             let shape = raygrad_compiler::Shape::new(&[], 1);
             bound.insert(key.to_string(), Array::floats(&shape, vec![value]));
         }

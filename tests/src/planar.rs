@@ -4,8 +4,9 @@ use crate::backend::load;
 use crate::{Rng, seed};
 use raygrad::config::Layered;
 use raygrad::geometry::Grid;
+use raygrad::planar::PlanarModel;
 use raygrad::planar::model::{GRID, TARGET};
-use raygrad::planar::{PlanarModel, Rates, rates::STEP};
+use raygrad::training::{Rates, optimise::STEP};
 use raygrad::warps;
 use raygrad_compiler::Step;
 use raygrad_compiler::functions::mlp::Init;
@@ -114,7 +115,7 @@ impl Planar {
     /// Sets the values of step `it`.
     pub fn at_step(&mut self, it: usize) {
         for (name, value) in Rates::at(&self.model.settings.optim, it).inputs() {
-            let value = Array::floats(&Shape::new(&[], 1), vec![value as f64]);
+            let value = Array::floats(&Shape::new(&[], 1), vec![f64::from(value as f32)]);
             self.bindings.insert(name.into(), value);
         }
     }
@@ -179,7 +180,7 @@ pub fn train(device: &Device, planar: &mut Planar, steps: usize) -> Trajectory {
     for it in 0..steps {
         for (name, value) in Rates::at(&planar.model.settings.optim, it).inputs() {
             if session.inputs().any(|(known, _)| known == name) {
-                session.set(name, &[value]).unwrap_or_else(|e| panic!("{e}"));
+                session.set(name, &[value as f32]).unwrap_or_else(|e| panic!("{e}"));
             }
         }
         if session.inputs().any(|(known, _)| known == STEP) {

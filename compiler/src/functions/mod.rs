@@ -9,8 +9,10 @@
 //! | [`rigid_fit`] | closed-form rotation, translation and rigid motion between point sets |
 //! | [`homography`] | direct linear transform |
 //! | [`image`] | bilinear lookup |
+//! | [`composite`] | depth samples and volume rendering |
 //! | [`loss`], [`adam`] | mean squared error, the Adam update |
 pub mod adam;
+pub mod composite;
 pub mod homography;
 pub mod image;
 pub mod lie;

@@ -136,7 +136,7 @@ fn load(name: &str, below: &mut Vec<String>) -> Result<Layered, ConfigError> {
 
 /// A file without a base: it must set everything.
 fn root(name: String, file: String, leaves: Vec<Leaf>) -> Result<Layered, ConfigError> {
-    let known: Vec<String> = known_keys();
+    let known: Vec<String> = known_keys(leaves.iter().any(|l| l.key.starts_with("scene.")));
     let (mut table, mut origins) = (Table::new(), BTreeMap::new());
     for leaf in leaves {
         if !known.contains(&leaf.key) {
@@ -155,9 +155,10 @@ fn root(name: String, file: String, leaves: Vec<Leaf>) -> Result<Layered, Config
     Ok(Layered { name, settings, table, origins })
 }
 
-/// The keys of the preset that sets them all.
-fn known_keys() -> Vec<String> {
-    let text = PRESETS.iter().find(|p| !p.text.contains("\nbase ")).map_or("", |p| p.text);
+/// The keys of the preset that sets them all, in 3D or 2D.
+fn known_keys(space: bool) -> Vec<String> {
+    let root = |p: &&Preset| !p.text.contains("\nbase ") && p.text.contains("\n[scene]") == space;
+    let text = PRESETS.iter().find(root).map_or("", |p| p.text);
     let lines = LineIndex::new("", text);
     let mut leaves = vec![];
     if let Ok(document) = DeTable::parse(text) {

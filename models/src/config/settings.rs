@@ -8,7 +8,18 @@ use std::str::FromStr;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Settings {
+    /// In 2D: the picture and its patches.
+    #[serde(default, skip_serializing_if = "Data::is_absent")]
     pub data: Data,
+    /// In 3D: images and cameras.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scene: Option<SceneSettings>,
+    /// In 3D: rays and samples of a step.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub train: Option<TrainSettings>,
+    /// In 3D: what the field adds to the picture's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub radiance: Option<RadianceSettings>,
     pub noise: Noise,
     pub warp: WarpSettings,
     pub field: FieldSettings,
@@ -31,10 +42,84 @@ pub struct Data {
     pub perturbation: String,
 }
 
+impl Data {
+    /// Whether there is no picture: a 3D experiment.
+    pub fn is_absent(&self) -> bool {
+        self.patches == 0
+    }
+}
+
+impl Default for Data {
+    /// No picture.
+    fn default() -> Data {
+        let (image, perturbation) = (String::new(), String::new());
+        let (image_size, points_per_patch) = (ImageSize::Photo, Count::All);
+        Data { image, image_size, patch_crop: [0, 0], patches: 0, points_per_patch, perturbation }
+    }
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SceneSettings {
+    /// A folder of a known layout.
+    pub path: String,
+    /// Rows, columns.
+    pub image_size: [usize; 2],
+    pub train_views: Count,
+    pub val_views: Count,
+    pub test_views: Count,
+    /// `truth`, `identity`, `noisy`, or a file of poses.
+    pub poses: String,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainSettings {
+    /// Of one step, over all views.
+    pub rays: usize,
+    /// Of one ray.
+    pub samples: usize,
+    pub stratified: bool,
+    pub depth: DepthSettings,
+    /// Near, far; inverse depths for `inverse`.
+    pub range: [f64; 2],
+    pub density_noise: f64,
+    pub opaque_background: bool,
+    pub refine_steps: usize,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RadianceSettings {
+    pub skip: Vec<usize>,
+    pub color_layers: Vec<usize>,
+    pub view_dependent: bool,
+    pub view_bands: usize,
+    pub density: Density,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum DepthSettings {
+    Metric,
+    Inverse,
+    /// Metric, near and far following the cameras' spread.
+    Auto,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Density {
+    Softplus,
+    Relu,
+}
+
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Noise {
     pub kind: NoiseKind,
+    /// In 2D.
+    #[serde(default)]
     pub homography: f64,
     pub rotation: f64,
     pub translation: f64,

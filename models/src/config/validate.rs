@@ -2,17 +2,22 @@
 
 use super::error::ConfigError;
 use super::layers::Layered;
-use super::settings::{Count, Encoding, ImageSize, Method, NoiseKind};
+use super::settings::{Count, DepthSettings, Dof, Encoding, ImageSize, Method, NoiseKind};
 
 /// Widest layer and most bands a configuration may ask for: more is a typing error, not an experiment.
 const MAX_WIDTH: usize = 4096;
 const MAX_BANDS: usize = 20;
 const MAX_SIDE: usize = 16384;
+/// Most samples of a ray.
+const MAX_SAMPLES: usize = 1024;
 
 impl Layered {
     /// Checks every value that needs no other file.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        self.data()?;
+        match &self.settings.scene {
+            None => self.data()?,
+            Some(_) => self.space()?,
+        }
         self.networks()?;
         self.numbers()?;
         self.loss()
@@ -21,6 +26,9 @@ impl Layered {
     fn data(&self) -> Result<(), ConfigError> {
         let d = &self.settings.data;
         self.at_least("data.patches", d.patches, 1)?;
+        if self.settings.warp.dof == Dof::Pose {
+            return Err(self.refuse("warp.dof", "patches of a picture have 1, 2, 3 or 8 degrees of freedom, found 6"));
+        }
         if self.settings.noise.kind == NoiseKind::Barf && d.patches > 5 {
             let text = format!("the noise kind \"barf\" has shifts for at most 5 patches, found {}", d.patches);
             return Err(self.refuse("data.patches", text));
@@ -40,6 +48,60 @@ impl Layered {
         if let Count::Of(n) = d.points_per_patch {
             // Four correspondences are the least that determine a homography.
             self.at_least("data.points_per_patch", n, 4)?;
+        }
+        Ok(())
+    }
+
+    fn space(&self) -> Result<(), ConfigError> {
+        let s = &self.settings;
+        let (Some(scene), Some(train), Some(radiance)) = (&s.scene, &s.train, &s.radiance) else {
+            return Err(self.refuse("scene.path", "a 3D experiment has the sections scene, train and radiance"));
+        };
+        let [h, w] = scene.image_size;
+        if h == 0 || w == 0 || h > MAX_SIDE || w > MAX_SIDE {
+            let text = format!("expected 1 to {MAX_SIDE} rows and columns, found {h} x {w}");
+            return Err(self.refuse("scene.image_size", text));
+        }
+        self.at_least("train.rays", train.rays, 1)?;
+        self.at_least("train.samples", train.samples, 2)?;
+        if train.samples > MAX_SAMPLES {
+            let text = format!("expected 2 to {MAX_SAMPLES} samples, found {}", train.samples);
+            return Err(self.refuse("train.samples", text));
+        }
+        let [near, far] = train.range;
+        let ordered = match train.depth {
+            DepthSettings::Metric => 0.0 <= near && near < far && far.is_finite(),
+            DepthSettings::Inverse => near > far && far >= 0.0 && near.is_finite(),
+            DepthSettings::Auto => true,
+        };
+        if !ordered {
+            let rule = match train.depth {
+                DepthSettings::Inverse => "[near, far] as inverse depths, near > far >= 0",
+                _ => "[near, far] with 0 <= near < far",
+            };
+            return Err(self.refuse("train.range", format!("expected {rule}, found [{near}, {far}]")));
+        }
+        if s.warp.method != Method::None && s.warp.dof != Dof::Pose {
+            return Err(
+                self.refuse("warp.dof", format!("a camera has 6 degrees of freedom, found {}", s.warp.dof.count()))
+            );
+        }
+        if let Some(bad) = radiance.skip.iter().find(|k| **k == 0 || **k >= s.field.layers.len()) {
+            let text = format!("layer {bad} cannot skip: expected 1 to {}", s.field.layers.len().saturating_sub(1));
+            return Err(self.refuse("radiance.skip", text));
+        }
+        if radiance.color_layers.iter().any(|n| *n == 0 || *n > MAX_WIDTH) {
+            let text = format!("expected layers 1 to {MAX_WIDTH} wide, found {:?}", radiance.color_layers);
+            return Err(self.refuse("radiance.color_layers", text));
+        }
+        if radiance.view_bands > MAX_BANDS {
+            let text = format!("expected at most {MAX_BANDS} bands, found {}", radiance.view_bands);
+            return Err(self.refuse("radiance.view_bands", text));
+        }
+        if !(train.density_noise >= 0.0 && train.density_noise.is_finite()) {
+            return Err(
+                self.refuse("train.density_noise", format!("expected 0 or more, found {}", train.density_noise))
+            );
         }
         Ok(())
     }

@@ -3,10 +3,8 @@
 
 pub mod data;
 pub mod model;
-pub mod rates;
 pub mod trainer;
 
 pub use data::{DataError, PlanarData};
 pub use model::{PlanarModel, weights};
-pub use rates::Rates;
 pub use trainer::{Evaluation, Trainer};

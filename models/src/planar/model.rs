@@ -8,13 +8,11 @@
 //!
 //! T_b is the closed-form fit of y to x. The step trains on all pixels, or on some drawn anew in every step.
 
-use super::rates::{BIAS1, BIAS2, LR_FIELD, LR_WARP, PROGRESS, STEP};
 use crate::config::{Count, Settings};
 use crate::fields::NeuralImage;
 use crate::geometry::Grid;
+use crate::training::optimise::{self, PROGRESS, STEP};
 use crate::warps::{self, Points, Registration, Warp};
-use raygrad_compiler::autodiff::grad;
-use raygrad_compiler::functions::adam::{Adam, Moments, StepScalars};
 use raygrad_compiler::functions::loss::mean_squared_error;
 use raygrad_compiler::functions::mlp::Parameter;
 use raygrad_compiler::ops::input::Role;
@@ -168,33 +166,16 @@ impl PlanarModel {
         (Points::planar(all.frame, point, xy), self.target().take(&index, &self.pixel))
     }
 
-    /// Adam on every parameter; field and warp have learning rates of their own.
+    /// Adam on every parameter; where codes of zeros are the identity, the gauge is held by them.
     #[track_caller]
     fn updates(&self, total: &Tensor) -> Vec<(Tensor, Tensor)> {
-        let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
-        let scalars = |lr| StepScalars { lr: scalar(lr), bias1: scalar(BIAS1), bias2: scalar(BIAS2) };
-        let (of_field, of_warp) = (scalars(LR_FIELD), scalars(LR_WARP));
-        let all: Vec<(Tensor, &StepScalars)> = (self.field.parameters().into_iter().map(|p| (p.tensor, &of_field)))
-            .chain(self.warp_parameters().map(|p| (p.tensor, &of_warp)))
-            .collect();
-        let gradients = grad(total, &all.iter().map(|(p, _)| p).collect::<Vec<_>>());
-        let mut updates = vec![];
-        for ((parameter, scalars), gradient) in all.iter().zip(&gradients) {
-            let old = Moments::of(parameter);
-            let (mut value, new) = Adam::default().update(parameter, gradient, &old, scalars);
-            if self.is_reset(parameter) {
-                let first = Tensor::index(&self.frame).equal(&Tensor::integers(&[0]));
-                value = first.select(&Tensor::scalar(0.0), &value);
-            }
-            updates.extend([(parameter.clone(), value), (old.m, new.m), (old.v, new.v)]);
+        let warp: Vec<Parameter> = self.warp_parameters().collect();
+        let mut updates = optimise::updates(total, &self.field.parameters(), &warp);
+        let held = self.settings.warp.fix_first && self.warp.zero_code_is_identity();
+        if let Some(code) = self.code.as_ref().filter(|_| held) {
+            optimise::hold_first(&mut updates, &code.tensor, &self.frame);
         }
         updates
-    }
-
-    /// Whether the gauge resets the first row of this parameter after the step.
-    fn is_reset(&self, parameter: &Tensor) -> bool {
-        let is_code = self.code.as_ref().is_some_and(|c| c.tensor.id() == parameter.id());
-        is_code && self.settings.warp.fix_first && self.warp.zero_code_is_identity()
     }
 }
 

@@ -2,20 +2,17 @@
 
 use super::data::PlanarData;
 use super::model::{self, PlanarModel};
-use super::rates::{Rates, STEP};
 use crate::Error;
-use crate::config::Settings;
-use crate::data::Random;
+use crate::config::{Count, Layered, Settings};
 use crate::geometry::Transform;
 use crate::pictures::View;
-use crate::run::checkpoint::{Checkpoint, Saved};
-use crate::run::metrics::{CornerError, Entry};
+use crate::run::metrics::{CornerError, Entry, Final, Measured, Metrics};
+use crate::run::{RunFolder, results};
+use crate::training::learner::psnr;
+use crate::training::{Learner, Training};
 use crate::warps::{KNOWN_TRUTH, Warp};
-use raygrad_compiler::functions::mlp::Init;
-use raygrad_compiler::ops::input::Role;
-use raygrad_compiler::{Channels, Program, Shape, compile};
-use raygrad_runtime::{Device, InputInfo, ProgramId, Session};
-use std::collections::BTreeMap;
+use raygrad_compiler::Program;
+use raygrad_runtime::{Device, ProgramId};
 use std::sync::Arc;
 
 /// Longer side of the pictures of the animation.
@@ -25,17 +22,13 @@ const FRAME_SIDE: usize = 320;
 pub struct Trainer {
     pub data: PlanarData,
     settings: Settings,
-    session: Session,
-    inputs: BTreeMap<String, InputInfo>,
+    learner: Learner,
     train: ProgramId,
     evaluate: ProgramId,
     frame: (View, ProgramId),
     full: (View, ProgramId),
-    device: String,
     flops: f64,
-    /// Steps done.
-    step: usize,
-    /// Whether any of them was done here, so that the training program has outputs.
+    /// Whether any step was done here, so that the training program has outputs.
     stepped: bool,
 }
 
@@ -56,166 +49,60 @@ impl Trainer {
     /// Compiles the programs and fills their inputs.
     pub fn new(settings: &Settings, data: PlanarData, warp: Arc<dyn Warp>, device: Device) -> Result<Trainer, Error> {
         let model = PlanarModel::new(settings, data.grid, warp);
-        let (target, name) = (device.target(), device_name(&device));
-        let mut session = Session::new(device)?;
-        let mut add = |program: Program| session.add(program);
+        let mut learner = Learner::new(device, &settings.optim)?;
         let (frame_view, full_view) = (View::within(data.grid, FRAME_SIDE), View::full(data.grid));
-        let train = add(compile(&model.train_step(), &target)?)?;
-        let evaluate = add(compile(&model.evaluation(), &target)?)?;
-        let frame = add(compile(&model.picture(frame_view.width * frame_view.height), &target)?)?;
-        let full = add(compile(&model.picture(full_view.width * full_view.height), &target)?)?;
-        let inputs = session.inputs().map(|(name, info)| (name.to_string(), info.clone())).collect();
-        let (frame, full) = ((frame_view, frame), (full_view, full));
+        let train = learner.add(&model.train_step())?;
+        let evaluate = learner.add(&model.evaluation())?;
+        let frame = learner.add(&model.picture(frame_view.width * frame_view.height))?;
+        let full = learner.add(&model.picture(full_view.width * full_view.height))?;
+        learner.fill(&model.parameters(), settings.run.seed)?;
+        learner.set_seed(model::SEED, settings.run.seed)?;
+        let (frame, full, flops) = ((frame_view, frame), (full_view, full), model.flops());
         let settings = settings.clone();
-        let mut trainer = Trainer {
-            data,
-            settings,
-            session,
-            inputs,
-            train,
-            evaluate,
-            frame,
-            full,
-            device: name,
-            flops: model.flops(),
-            step: 0,
-            stepped: false,
-        };
+        let mut trainer = Trainer { data, settings, learner, train, evaluate, frame, full, flops, stepped: false };
         trainer.fill_data()?;
-        trainer.fill_parameters(&model)?;
         Ok(trainer)
-    }
-
-    /// Steps done so far.
-    pub fn steps_done(&self) -> usize {
-        self.step
     }
 
     /// The program of a training step.
     pub fn program(&self) -> &Program {
-        self.session.program(self.train)
-    }
-
-    /// What it trains on, for people.
-    pub fn device_name(&self) -> String {
-        self.device.clone()
-    }
-
-    /// One training step. On a GPU this only submits it.
-    pub fn step(&mut self) -> Result<(), Error> {
-        self.set_rates()?;
-        self.session.run(self.train)?;
-        (self.step, self.stepped) = (self.step + 1, true);
-        Ok(())
-    }
-
-    /// Floating-point operations of a step, see [`PlanarModel::flops`].
-    pub fn flops(&self) -> f64 {
-        self.flops
-    }
-
-    /// Waits until the last step is done.
-    pub fn wait(&mut self) -> Result<(), Error> {
-        self.session.read(self.train, "total")?;
-        Ok(())
-    }
-
-    /// Losses and corner errors of the last step, as its forward pass saw them.
-    pub fn measure(&mut self) -> Result<Entry, Error> {
-        let (entry, _) = self.read_entry(self.train)?;
-        Ok(entry)
+        self.learner.program(self.train)
     }
 
     /// The estimated warps, as the last step saw them, or those that training starts from.
     pub fn warps(&mut self) -> Result<Vec<Transform>, Error> {
         let program = if self.stepped { self.train } else { self.evaluate };
         if !self.stepped {
-            self.set_rates()?;
-            self.session.run(self.evaluate)?;
+            self.learner.run(self.evaluate)?;
         }
-        Ok(self.session.read(program, "transform")?.chunks(9).map(Transform::from_rows).collect())
+        Ok(self.learner.read(program, "transform")?.chunks(9).map(Transform::from_rows).collect())
     }
 
     /// Runs the model over all pixels.
     pub fn evaluate(&mut self) -> Result<Evaluation, Error> {
-        self.set_rates()?;
-        self.session.run(self.evaluate)?;
+        self.learner.run(self.evaluate)?;
         let (entry, warps) = self.read_entry(self.evaluate)?;
-        let mut read = |name| self.session.read(self.evaluate, name);
+        let mut read = |name| self.learner.read(self.evaluate, name);
         Ok(Evaluation { entry, warps, local: read("local")?, global: read("global")?, color: read("color")? })
     }
 
     /// The learned picture, small for the animation or with all its pixels.
     pub fn picture(&mut self, full: bool) -> Result<(View, Vec<f32>), Error> {
         let (view, program) = if full { self.full } else { self.frame };
-        self.set_rates()?;
-        self.session.run(program)?;
-        Ok((view, self.session.read(program, "color")?))
-    }
-
-    /// Everything that carries over to the next step.
-    pub fn tensors(&mut self) -> Result<BTreeMap<String, Saved>, Error> {
-        let mut tensors = BTreeMap::new();
-        for (name, shape) in self.checkpoint_shapes() {
-            let values = self.session.get(&name)?;
-            tensors.insert(name, Saved { shape, values });
-        }
-        Ok(tensors)
-    }
-
-    /// Names and shapes of what a checkpoint holds.
-    pub fn checkpoint_shapes(&self) -> BTreeMap<String, Vec<usize>> {
-        let carried = self.inputs.iter().filter(|(_, i)| matches!(i.role, Role::Parameter | Role::State));
-        carried.map(|(name, i)| (name.clone(), dimensions(&i.shape))).collect()
-    }
-
-    /// Continues from a checkpoint, whose shapes have been checked.
-    pub fn restore(&mut self, checkpoint: &Checkpoint) -> Result<(), Error> {
-        for (name, saved) in &checkpoint.tensors {
-            self.session.set(name, &saved.values)?;
-        }
-        self.step = checkpoint.step;
-        Ok(())
+        self.learner.run(program)?;
+        Ok((view, self.learner.read(program, "color")?))
     }
 
     fn read_entry(&mut self, program: ProgramId) -> Result<(Entry, Vec<Transform>), Error> {
-        let mut loss = BTreeMap::new();
-        for name in ["render", "alignment", "total"] {
-            if self.session.program(program).outputs.iter().any(|(n, _)| n == name) {
-                let value = f64::from(self.session.read(program, name)?[0]);
-                self.check_finite(name, &[value])?;
-                loss.insert(name.to_string(), value);
-            }
-        }
-        let rows = self.session.read(program, "transform")?;
+        let loss = self.learner.losses(program)?;
+        let rows = self.learner.read(program, "transform")?;
         let warps: Vec<Transform> = rows.chunks(9).map(Transform::from_rows).collect();
         let per_patch: Vec<f64> =
             warps.iter().zip(&self.data.truth).map(|(w, t)| self.data.grid.corner_error(w, t)).collect();
-        self.check_finite("corner error", &per_patch)?;
-        let render = loss.get("render").copied().unwrap_or(1.0);
-        // A perfect picture has no finite PSNR; JSON no infinity.
-        let patch_psnr_db = -10.0 * render.max(1e-20).log10();
-        let entry = Entry { step: self.step, loss, patch_psnr_db, corner_error_px: CornerError::new(per_patch) };
-        Ok((entry, warps))
-    }
-
-    fn check_finite(&self, what: &str, values: &[f64]) -> Result<(), Error> {
-        match values.iter().all(|v| v.is_finite()) {
-            true => Ok(()),
-            false => Err(Error::NotFinite { what: what.to_string(), step: self.step }),
-        }
-    }
-
-    fn set_rates(&mut self) -> Result<(), Error> {
-        for (name, value) in Rates::at(&self.settings.optim, self.step).inputs() {
-            if self.inputs.contains_key(name) {
-                self.session.set(name, &[value])?;
-            }
-        }
-        if self.inputs.contains_key(STEP) {
-            self.session.set_u32(STEP, &[self.step as u32])?;
-        }
-        Ok(())
+        self.learner.check_finite("corner error", &per_patch)?;
+        let patch_psnr_db = psnr(loss.get("render").copied().unwrap_or(1.0));
+        let measured = Measured::Planar { patch_psnr_db, corner_error_px: CornerError::new(per_patch) };
+        Ok((Entry { step: self.learner.steps_done(), loss, measured }, warps))
     }
 
     fn fill_data(&mut self) -> Result<(), Error> {
@@ -229,48 +116,68 @@ impl Trainer {
         for view in [self.frame.0, self.full.0] {
             data.push((model::view(view.width * view.height), view.points()));
         }
-        for (name, values) in data {
-            if self.inputs.contains_key(&name) {
-                self.session.set(&name, &values)?;
-            }
-        }
-        if self.inputs.contains_key(model::SEED) {
-            // Spread, so that the draws of seed s at step t are not those of seed s + 1 at step t - 1.
-            self.session.set_u32(model::SEED, &[self.settings.run.seed.wrapping_mul(0x9e37_79b9)])?;
-        }
-        Ok(())
-    }
-
-    fn fill_parameters(&mut self, model: &PlanarModel) -> Result<(), Error> {
-        for p in model.parameters() {
-            let Some(name) = p.tensor.input_name().filter(|n| self.inputs.contains_key(*n)) else { continue };
-            let mut random = Random::new(self.settings.run.seed, name);
-            let mut draw = || match p.init {
-                Init::Zero => 0.0,
-                Init::Uniform(bound) => bound * (2.0 * random.uniform() - 1.0),
-                Init::Normal(deviation) => deviation * random.normal(),
-            };
-            let values: Vec<f32> = (0..p.tensor.shape().lanes()).map(|_| draw() as f32).collect();
-            self.session.set(name, &values)?;
-        }
-        Ok(())
+        data.iter().try_for_each(|(name, values)| self.learner.set(name, values))
     }
 }
 
-fn device_name(device: &Device) -> String {
-    match device {
-        Device::Cpu { pool } => format!("CPU, {} threads", pool.current_num_threads()),
-        #[cfg(feature = "wgpu")]
-        Device::Wgpu { gpu } => gpu.adapter().name.clone(),
+impl Training for Trainer {
+    fn learner(&self) -> &Learner {
+        &self.learner
     }
-}
-
-/// Sizes of the axes, then of the channels.
-fn dimensions(shape: &Shape) -> Vec<usize> {
-    let mut sizes: Vec<usize> = shape.axes.iter().map(|a| a.size()).collect();
-    match shape.channels {
-        Channels::Vector(n) => sizes.push(n),
-        Channels::Matrix(rows, columns) => sizes.extend([rows, columns]),
+    fn learner_mut(&mut self) -> &mut Learner {
+        &mut self.learner
     }
-    sizes
+    fn step(&mut self) -> Result<(), Error> {
+        self.learner.train(self.train)?;
+        self.stepped = true;
+        Ok(())
+    }
+    fn wait(&mut self) -> Result<(), Error> {
+        self.learner.read(self.train, "total")?;
+        Ok(())
+    }
+    fn measure(&mut self) -> Result<Entry, Error> {
+        let (entry, _) = self.read_entry(self.train)?;
+        Ok(entry)
+    }
+    fn flops(&self) -> f64 {
+        self.flops
+    }
+    fn launches(&self) -> usize {
+        self.program().launches.len()
+    }
+    fn rows(&self) -> usize {
+        self.settings.data.points_per_patch.of(self.data.grid.crop_pixels())
+    }
+    fn work(&self) -> String {
+        format!("{} points a patch", self.rows())
+    }
+    fn write_data(&self, folder: &RunFolder) -> Result<(), Error> {
+        results::write_data(folder, &self.settings, &self.data)
+    }
+    fn write_frame(&mut self, folder: &RunFolder) -> Result<(), Error> {
+        results::write_frame(folder, self)
+    }
+    fn finish(
+        &mut self,
+        folder: &RunFolder,
+        layered: &Layered,
+        metrics: &mut Metrics,
+        seconds: &dyn Fn() -> f64,
+    ) -> Result<(), Error> {
+        let found = self.evaluate()?;
+        let warps = found.warps.iter().map(|w| std::array::from_fn(|i| w.0[(i / 3, i % 3)])).collect();
+        metrics.last = Some(Final { entry: found.entry.clone(), seconds: seconds(), warps });
+        results::write_results(folder, layered, self, &found, metrics)
+    }
+    fn summary(&self, last: &Final) -> String {
+        let Measured::Planar { patch_psnr_db, corner_error_px } = &last.entry.measured else { return String::new() };
+        let errors: Vec<String> = corner_error_px.per_patch.iter().map(|e| format!("{e:.2}")).collect();
+        let drawn = if self.settings.data.points_per_patch == Count::All { "" } else { ", measured on all pixels" };
+        let (mean, steps, time) = (corner_error_px.mean, last.entry.step, crate::report::duration(last.seconds));
+        format!(
+            "corner error  {mean:.3} px  (patches: {})\npatch PSNR    {patch_psnr_db:.2} dB\nsteps         {steps} in {time}{drawn}\n",
+            errors.join(", ")
+        )
+    }
 }

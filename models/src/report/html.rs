@@ -2,7 +2,7 @@
 
 use super::plots::{Curve, PlotError, plot};
 use crate::pictures::patch_color;
-use crate::run::metrics::{Entry, Metrics};
+use crate::run::metrics::{Entry, Measured, Metrics};
 use base64::{Engine, prelude::BASE64_STANDARD};
 use std::fmt::Write;
 
@@ -87,14 +87,24 @@ impl Report<'_> {
 
     fn headline(&self) -> String {
         let Some(last) = &self.metrics.last else { return String::new() };
-        let cards = [
-            (format!("{:.2} px", last.entry.corner_error_px.mean), "mean corner error"),
-            (format!("{:.1} dB", last.entry.patch_psnr_db), "patch PSNR"),
+        let mut cards = match &last.entry.measured {
+            Measured::Planar { corner_error_px, .. } => {
+                vec![(format!("{:.2} px", corner_error_px.mean), "mean corner error")]
+            }
+            Measured::Space { rotation_error_deg, translation_error_x100, .. } => {
+                let rotation = rotation_error_deg.map(|r| (format!("{r:.2}°"), "rotation error"));
+                let translation = translation_error_x100.map(|t| (format!("{t:.2}"), "translation error x 100"));
+                rotation.into_iter().chain(translation).collect()
+            }
+        };
+        cards.extend([
+            (format!("{:.1} dB", last.entry.psnr_db()), "PSNR of the last pixels"),
             (duration(last.seconds), "time"),
             (last.entry.step.to_string(), "steps"),
-        ];
-        let cards = cards.map(|(value, what)| format!("<div class=card><b>{value}</b><span>{what}</span></div>"));
-        format!("<div class=cards>{}</div>", cards.concat())
+        ]);
+        let cards =
+            cards.iter().map(|(value, what)| format!("<div class=card><b>{value}</b><span>{what}</span></div>"));
+        format!("<div class=cards>{}</div>", cards.collect::<String>())
     }
 
     fn plots(&self) -> Result<Vec<(&'static str, String)>, PlotError> {
@@ -114,24 +124,47 @@ impl Report<'_> {
             .map(|(name, color)| curve(name, *color, 2, &|e| e.loss.get(*name).copied()))
             .filter(|c| !c.points.is_empty())
             .collect();
-        let psnr = [curve("patch PSNR", palette[1], 2, &|e| Some(e.patch_psnr_db))];
-        let patches = steps.first().map_or(0, |e| e.corner_error_px.per_patch.len());
+        let psnr = [curve("PSNR", palette[1], 2, &|e| Some(e.psnr_db()))];
+        let mut plots = vec![
+            ("Loss terms before weighting, and their weighted sum.", plot("loss", &losses, true)?),
+            ("PSNR of the rendered pixels.", plot("dB", &psnr, false)?),
+        ];
+        let patches = steps.first().and_then(Entry::corners).map_or(0, |c| c.per_patch.len());
+        let of_patch = |i: usize| move |e: &Entry| e.corners()?.per_patch.get(i).copied();
         let mut corners: Vec<Curve> = (0..patches)
-            .map(|i| curve(&format!("patch {i}"), patch_color(i), 1, &|e| e.corner_error_px.per_patch.get(i).copied()))
+            .map(|i| curve(&format!("patch {i}"), patch_color(i), 1, &of_patch(i)))
             .filter(|c| c.points.iter().any(|p| p.1 > 1e-3))
             .collect();
-        corners.push(curve("mean", palette[0], 3, &|e| Some(e.corner_error_px.mean)));
-        Ok(vec![
-            ("Loss terms before weighting, and their weighted sum.", plot("loss", &losses, true)?),
-            ("PSNR of the rendered patch pixels.", plot("dB", &psnr, false)?),
-            ("Distance between estimated and true patch corners.", plot("corner error, px", &corners, true)?),
-        ])
+        if patches > 0 {
+            corners.push(curve("mean", palette[0], 3, &|e| Some(e.corners()?.mean)));
+            let caption = "Distance between estimated and true patch corners.";
+            plots.push((caption, plot("corner error, px", &corners, true)?));
+        }
+        let errors: [(_, &str, fn(&Entry) -> Option<f64>); 2] = [
+            ("Rotation error of the training views, after alignment.", "degrees", |e| match e.measured {
+                Measured::Space { rotation_error_deg, .. } => rotation_error_deg,
+                Measured::Planar { .. } => None,
+            }),
+            ("Translation error of the training views, times 100.", "x 100", |e| match e.measured {
+                Measured::Space { translation_error_x100, .. } => translation_error_x100,
+                Measured::Planar { .. } => None,
+            }),
+        ];
+        for (caption, what, value) in errors {
+            let error = [curve(what, palette[2], 2, &value)];
+            if !error[0].points.is_empty() {
+                plots.push((caption, plot(what, &error, true)?));
+            }
+        }
+        Ok(plots)
     }
 
     fn patches(&self) -> String {
-        let Some(last) = &self.metrics.last else { return String::new() };
+        let Some(corners) = self.metrics.last.as_ref().and_then(|last| last.entry.corners()) else {
+            return String::new();
+        };
         let (mut head, mut row) = (String::new(), String::new());
-        for (i, error) in last.entry.corner_error_px.per_patch.iter().enumerate() {
+        for (i, error) in corners.per_patch.iter().enumerate() {
             let [r, g, b] = patch_color(i);
             let _ = write!(head, "<th><span class=dot style=\"background:rgb({r},{g},{b})\"></span>patch {i}</th>");
             let _ = write!(row, "<td>{error:.3} px</td>");

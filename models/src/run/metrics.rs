@@ -10,10 +10,56 @@ pub struct Entry {
     pub step: usize,
     /// The loss terms before weighting, and their weighted sum as `total`.
     pub loss: BTreeMap<String, f64>,
-    /// -10 log10 of the rendering loss of this step.
-    pub patch_psnr_db: f64,
-    /// Distance in pixels between estimated and true patch corners.
-    pub corner_error_px: CornerError,
+    #[serde(flatten)]
+    pub measured: Measured,
+}
+
+/// What is measured besides the losses.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum Measured {
+    Planar {
+        /// -10 log10 of the rendering loss of this step.
+        patch_psnr_db: f64,
+        /// Distance in pixels between estimated and true patch corners.
+        corner_error_px: CornerError,
+    },
+    Space {
+        /// -10 log10 of the rendering loss of this step.
+        psnr_db: f64,
+        /// Mean over the training views after alignment; none where no true poses are known.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        rotation_error_deg: Option<f64>,
+        /// A hundred times the mean distance between estimated and true world-to-camera translations.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        translation_error_x100: Option<f64>,
+    },
+}
+
+impl Entry {
+    /// PSNR of the step's pixels, in dB.
+    pub fn psnr_db(&self) -> f64 {
+        match self.measured {
+            Measured::Planar { patch_psnr_db: psnr, .. } | Measured::Space { psnr_db: psnr, .. } => psnr,
+        }
+    }
+    /// Corner errors of a planar run.
+    pub fn corners(&self) -> Option<&CornerError> {
+        match &self.measured {
+            Measured::Planar { corner_error_px, .. } => Some(corner_error_px),
+            Measured::Space { .. } => None,
+        }
+    }
+    /// The registration error in words: "corners 0.75 px", "rotation 0.51 deg, translation 1.20".
+    pub fn error_text(&self) -> String {
+        match &self.measured {
+            Measured::Planar { corner_error_px, .. } => format!("corners {:.2} px", corner_error_px.mean),
+            Measured::Space { rotation_error_deg: Some(r), translation_error_x100: Some(t), .. } => {
+                format!("rotation {r:.2} deg  translation {t:.2}")
+            }
+            Measured::Space { .. } => String::new(),
+        }
+    }
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -36,7 +82,8 @@ pub struct Final {
     pub entry: Entry,
     /// Time spent in the run, over all its parts if it was resumed.
     pub seconds: f64,
-    /// The estimated warp of each patch, row by row.
+    /// The estimated warp of each patch, row by row; none in 3D.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub warps: Vec<[f64; 9]>,
 }
 

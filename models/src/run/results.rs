@@ -8,6 +8,7 @@ use crate::config::{Layered, Settings};
 use crate::pictures::{self, Canvas};
 use crate::planar::{Evaluation, PlanarData, Trainer};
 use crate::report::{Picture, Report};
+use crate::training::Training;
 
 /// Folder of the animation's frames, one PNG a step number.
 const FRAMES: &str = "frames";
@@ -76,8 +77,13 @@ pub fn write_results(
         shown.push(Picture { title: "Training", caption: "The learned picture and the outlines over training.", png });
     }
     let config = toml::to_string(&layered.settings).unwrap_or_default();
-    let report =
-        Report { title: &layered.name, device: &trainer.device_name(), metrics, pictures: shown, config: &config };
+    let report = Report {
+        title: &layered.name,
+        device: &trainer.learner().device_name(),
+        metrics,
+        pictures: shown,
+        config: &config,
+    };
     let report = report.to_html()?;
     let files = [
         ("reconstruction.png", &reconstruction),

@@ -98,7 +98,7 @@ pub trait Warp: Debug + Send + Sync {
 pub fn of_settings(settings: &Settings) -> Arc<dyn Warp> {
     let warp = &settings.warp;
     match warp.method {
-        Method::None => Arc::new(KnownWarp),
+        Method::None => Arc::new(KnownWarp { dof: warp.dof }),
         Method::Global => Arc::new(GlobalWarp { dof: warp.dof }),
         Method::Local => Arc::new(LocalWarp::new(warp)),
     }

@@ -5,3 +5,5 @@ mod fits;
 mod networks;
 mod planar;
 mod primitives;
+mod rendering;
+mod space;

@@ -25,7 +25,8 @@ struct Result {
     preset: String,
     device: String,
     threads: usize,
-    points_per_patch: usize,
+    /// Points of a patch, or rays, of a step.
+    rows: usize,
     steps: usize,
     launches: usize,
     /// Median over the timed steps.
@@ -44,7 +45,7 @@ const LEAST: usize = 10;
 
 pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
     let experiment = args.choice.experiment()?;
-    let mut trainer = experiment.trainer()?;
+    let mut trainer = experiment.training()?;
     let settings = &experiment.layered.settings;
     let threads = settings.run.threads.of(std::thread::available_parallelism().map_or(1, usize::from));
     if args.steps == Some(0) {
@@ -71,11 +72,11 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
     let gflop = trainer.flops() / 1e9;
     let result = Result {
         preset: args.choice.preset.clone(),
-        device: trainer.device_name(),
+        device: trainer.learner().device_name(),
         threads,
-        points_per_patch: settings.data.points_per_patch.of(trainer.data.grid.crop_pixels()),
+        rows: trainer.rows(),
         steps: times.len(),
-        launches: trainer.program().launches.len(),
+        launches: trainer.launches(),
         seconds_per_step: seconds,
         gflop_per_step: gflop,
         gflops: gflop / seconds,
@@ -86,7 +87,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
         println!("{}", serde_json::to_string(&result)?);
         return Ok(ExitCode::SUCCESS);
     }
-    println!("{} on {}, {} points a patch", result.preset, result.device, result.points_per_patch);
+    println!("{} on {}, {}", result.preset, result.device, trainer.work());
     println!("step      {:.2} ms (median of {}), {} launches", 1e3 * seconds, result.steps, result.launches);
     println!("rate      {:.1} GFLOP/s of {:.1} ({:.0} %)", result.gflops, peak, 100.0 * result.gflops / peak);
     println!("memory    {:.0} MB at most", result.peak_rss_mb);

@@ -33,8 +33,7 @@ impl Progress {
 
     fn state(entry: &Entry) -> String {
         let total = entry.loss.get("total").copied().unwrap_or(0.0);
-        let (psnr, corner) = (entry.patch_psnr_db, entry.corner_error_px.mean);
-        format!("loss {total:.5}  PSNR {psnr:.2} dB  corners {corner:.2} px")
+        format!("loss {total:.5}  PSNR {:.2} dB  {}", entry.psnr_db(), entry.error_text())
     }
 }
 

@@ -5,8 +5,6 @@ use crate::progress::Progress;
 use anyhow::Context;
 use clap::Args;
 use raygrad::Outcome;
-use raygrad::config::Count;
-use raygrad::report::duration;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -52,23 +50,16 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     })
     .context("cannot listen for Ctrl-C")?;
     let outcome = experiment.train_observed(&mut Progress::new(), &stop)?;
-    Ok(tell(&outcome, &experiment.layered.settings.data.points_per_patch))
+    Ok(tell(&outcome))
 }
 
-fn tell(outcome: &Outcome, points: &Count) -> ExitCode {
+fn tell(outcome: &Outcome) -> ExitCode {
     let folder = outcome.folder.display();
     if outcome.interrupted {
         println!("stopped; continue with the same command and `--out {folder} --resume`");
         return ExitCode::from(130);
     }
-    if let Some(last) = &outcome.metrics.last {
-        let errors: Vec<String> = last.entry.corner_error_px.per_patch.iter().map(|e| format!("{e:.2}")).collect();
-        let (mean, psnr) = (last.entry.corner_error_px.mean, last.entry.patch_psnr_db);
-        println!("corner error  {mean:.3} px  (patches: {})", errors.join(", "));
-        println!("patch PSNR    {psnr:.2} dB");
-        let drawn = if *points == Count::All { "" } else { ", measured on all pixels" };
-        println!("steps         {} in {}{drawn}", last.entry.step, duration(last.seconds));
-    }
+    print!("{}", outcome.summary);
     println!("results       {folder}/report.html");
     ExitCode::SUCCESS
 }

@@ -1,0 +1,68 @@
+//! Volume rendering along rays (Mildenhall et al., NeRF, ECCV 2020, equation 3) and its depth samples.
+//!
+//! ```text
+//! delta_i = depth_(i+1) - depth_i, the last one 1e10     a_i = density_i delta_i |d|
+//! alpha_i = 1 - exp(-a_i)    T_i = exp(-sum_(j<i) a_j)    weight_i = T_i alpha_i
+//! color = sum weight_i c_i   depth = sum weight_i depth_i  opacity = sum weight_i
+//! ```
+//!
+//! `|d|` is the length of the ray's direction, of which depths are multiples. The exponents stay apart: a product of the last
+//! interval with `exp(-a)` is taken only after the exponential, so neither pass meets infinity minus infinity.
+
+use super::expect_width;
+use crate::graph::{Axis, Tensor};
+
+/// Length of the interval behind the last sample.
+pub const LAST_INTERVAL: f64 = 1e10;
+
+/// How the depths of a ray's samples are spread.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Spread {
+    /// Evenly in depth.
+    Metric,
+    /// Evenly in inverse depth: `near` and `far` are inverse depths.
+    Inverse,
+}
+
+/// What a ray sees.
+#[derive(Clone, Debug)]
+pub struct Composite {
+    pub color: Tensor,
+    /// Expected depth, not divided by the opacity.
+    pub depth: Tensor,
+    pub opacity: Tensor,
+    /// Of every sample, along `sample` too.
+    pub weights: Tensor,
+}
+
+/// Depths of the samples of a ray: `near + (i + jitter) / S (far - near)`, or the inverse of that plus 1e-8. `jitter` is
+/// uniform in 0..1, or 0.5 for the middle of every interval.
+#[track_caller]
+pub fn depth_samples(sample: &Axis, jitter: &Tensor, near: &Tensor, far: &Tensor, spread: Spread) -> Tensor {
+    let share = (Tensor::index(sample).to_f32() + jitter) * (1.0 / sample.size() as f64);
+    let value = near + share * (far - near);
+    match spread {
+        Spread::Metric => value,
+        Spread::Inverse => 1.0 / (value + 1e-8),
+    }
+}
+
+/// Renders samples along the axis `sample`: `color` (any number of channels), `density` and `depth` (one channel each, the
+/// depths increasing), and the `length` of the ray's direction.
+#[track_caller]
+pub fn composite(color: &Tensor, density: &Tensor, depth: &Tensor, length: &Tensor, sample: &Axis) -> Composite {
+    for (what, t) in [("densities", density), ("depths", depth), ("lengths", length)] {
+        if let Err(bad) = expect_width("composite", what, t, 1) {
+            return Composite { color: bad.clone(), depth: bad.clone(), opacity: bad.clone(), weights: bad };
+        }
+    }
+    let last = Tensor::index(sample).equal(&Tensor::integers(&[sample.size() as u32 - 1]));
+    let interval = last.select(&Tensor::scalar(LAST_INTERVAL), &(depth.shift(sample, -1) - depth));
+    let absorbed = density * interval * length;
+    let alpha = 1.0 - (-&absorbed).exp();
+    // What is absorbed in the last interval lies behind every sample.
+    let before = last.select(&Tensor::scalar(0.0), &absorbed).cumsum(sample);
+    let weights = (-before).exp() * alpha;
+    let along = |t: &Tensor| (&weights * t).sum(&[sample]);
+    Composite { color: along(color), depth: along(depth), opacity: weights.sum(&[sample]), weights }
+}

@@ -1,0 +1,100 @@
+//! Rays of cameras, and where along them samples lie.
+//!
+//! Pixel (row, column) looks through `X = ((column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, 1)`; a rough pose `[R | t]` (world
+//! to camera) puts that at `R^T (X - t)` and the camera's centre at `-R^T t`. A warp moves both; the ray runs from the
+//! moved centre o towards the moved pixel, and its sample at depth z is `o + z d`, `d` not normalised: z is a depth along
+//! the optical axis.
+
+use crate::warps::Points;
+use raygrad_compiler::functions::matrix::{apply, apply_affine, invert_pose, split_pose};
+use raygrad_compiler::ops::pick::concat;
+use raygrad_compiler::{Axis, Tensor};
+
+/// Rows and columns of the images.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ImageSize {
+    pub height: usize,
+    pub width: usize,
+}
+
+impl ImageSize {
+    pub fn pixels(self) -> usize {
+        self.height * self.width
+    }
+}
+
+/// Pixels and centres of cameras of which rough poses are known.
+#[derive(Clone, Debug)]
+pub struct Cameras {
+    pub pixels: Points,
+    pub centers: Points,
+}
+
+impl Cameras {
+    /// `index`: pixel numbers (row by row) along `point`. `intrinsics`: fx, fy, cx, cy; `pose`: `(3, 4)`, along `frame` where
+    /// there are several cameras.
+    #[track_caller]
+    pub fn new(
+        frame: &Axis,
+        point: &Axis,
+        index: &Tensor,
+        size: ImageSize,
+        intrinsics: &Tensor,
+        pose: &Tensor,
+    ) -> Cameras {
+        let index = index.to_f32();
+        // Half a pixel more keeps the quotient away from whole numbers, where rounding would decide.
+        let row = ((&index + 0.5) * (1.0 / size.width as f64)).floor();
+        let column = index - &row * size.width as f64;
+        let position = concat([&column, &row]) + 0.5;
+        let xy = (position - intrinsics.slice(2..4)) / intrinsics.slice(0..2);
+        let from_camera = invert_pose(pose);
+        let plane = concat([&xy, &Tensor::scalar(1.0)]);
+        let (_, center) = split_pose(&from_camera);
+        let points =
+            |position, first| Points { frame: frame.clone(), point: point.clone(), xy: xy.clone(), position, first };
+        Cameras { pixels: points(apply_affine(&from_camera, &plane), 0), centers: points(center, point.size()) }
+    }
+}
+
+/// Rays: an origin and a direction of three channels each.
+#[derive(Clone, Debug)]
+pub struct Rays {
+    pub origin: Tensor,
+    /// Not normalised.
+    pub direction: Tensor,
+}
+
+impl Rays {
+    /// From mapped centres through mapped pixels.
+    #[track_caller]
+    pub fn through(center: &Tensor, pixel: &Tensor) -> Rays {
+        Rays { origin: center.clone(), direction: pixel - center }
+    }
+
+    #[track_caller]
+    pub fn length(&self) -> Tensor {
+        (&self.direction * &self.direction).sum_channels().sqrt()
+    }
+
+    #[track_caller]
+    pub fn at(&self, depth: &Tensor) -> Tensor {
+        &self.origin + depth * &self.direction
+    }
+}
+
+/// Depth range of Blender scenes, as parts of the largest distance between two cameras: 2 and 6 of 8.
+pub const NEAR_PART: f64 = 0.25;
+pub const FAR_PART: f64 = 0.75;
+
+/// Near and far from the spread of cameras with `poses` along `frame`: a quarter and three quarters of the largest distance
+/// between two of their centres. Nothing is differentiated through them.
+#[track_caller]
+pub fn range_of(poses: &Tensor, frame: &Axis) -> (Tensor, Tensor) {
+    let (rotation, translation) = split_pose(poses);
+    let center = -apply(&rotation.transpose(), &translation);
+    let other = Axis::new("other", frame.size());
+    let apart = &center - center.take(&Tensor::index(&other), frame);
+    let largest = (&apart * &apart).sum_channels().max_over(&[frame, &other]).sqrt().stop_gradient();
+    (&largest * NEAR_PART, largest * FAR_PART)
+}

@@ -1,0 +1,181 @@
+//! A device with the programs of an experiment, their inputs, and the count of steps.
+
+use super::optimise::{Rates, STEP};
+use crate::Error;
+use crate::config::Optim;
+use crate::data::Random;
+use crate::run::checkpoint::{Checkpoint, Saved};
+use raygrad_compiler::functions::mlp::{Init, Parameter};
+use raygrad_compiler::ops::input::Role;
+use raygrad_compiler::{Channels, Program, Shape, Step, compile};
+use raygrad_runtime::{Device, InputInfo, ProgramId, Session};
+use std::collections::BTreeMap;
+
+/// Programs that share parameters, and how far training has got.
+pub struct Learner {
+    pub session: Session,
+    device: Device,
+    optim: Optim,
+    inputs: BTreeMap<String, InputInfo>,
+    step: usize,
+}
+
+impl Learner {
+    pub fn new(device: Device, optim: &Optim) -> Result<Learner, Error> {
+        let session = Session::new(device.clone())?;
+        Ok(Learner { session, device, optim: optim.clone(), inputs: BTreeMap::new(), step: 0 })
+    }
+
+    /// Compiles one more program.
+    pub fn add(&mut self, step: &Step) -> Result<ProgramId, Error> {
+        let program = self.session.add(compile(step, &self.device.target())?)?;
+        self.inputs = self.session.inputs().map(|(name, info)| (name.to_string(), info.clone())).collect();
+        Ok(program)
+    }
+
+    pub fn steps_done(&self) -> usize {
+        self.step
+    }
+
+    pub fn program(&self, id: ProgramId) -> &Program {
+        self.session.program(id)
+    }
+
+    /// Whether any program has an input of this name.
+    pub fn has(&self, name: &str) -> bool {
+        self.inputs.contains_key(name)
+    }
+
+    /// Sets an input, if any program has it.
+    pub fn set(&mut self, name: &str, values: &[f32]) -> Result<(), Error> {
+        if self.has(name) {
+            self.session.set(name, values)?;
+        }
+        Ok(())
+    }
+
+    /// Sets an input of whole numbers, if any program has it.
+    pub fn set_u32(&mut self, name: &str, values: &[u32]) -> Result<(), Error> {
+        if self.has(name) {
+            self.session.set_u32(name, values)?;
+        }
+        Ok(())
+    }
+
+    /// Sets what tells the draws of two seeds apart: spread, so that those of seed s at step t are not those of seed s + 1 at
+    /// step t - 1.
+    pub fn set_seed(&mut self, name: &str, seed: u32) -> Result<(), Error> {
+        self.set_u32(name, &[seed.wrapping_mul(0x9e37_79b9)])
+    }
+
+    /// Draws the initial values of all parameters.
+    pub fn fill(&mut self, parameters: &[Parameter], seed: u32) -> Result<(), Error> {
+        for p in parameters {
+            let Some(name) = p.tensor.input_name().filter(|n| self.has(n)) else { continue };
+            let mut random = Random::new(seed, name);
+            let mut draw = || match p.init {
+                Init::Zero => 0.0,
+                Init::Uniform(bound) => bound * (2.0 * random.uniform() - 1.0),
+                Init::Normal(deviation) => deviation * random.normal(),
+            };
+            let values: Vec<f32> = (0..p.tensor.shape().lanes()).map(|_| draw() as f32).collect();
+            self.session.set(name, &values)?;
+        }
+        Ok(())
+    }
+
+    /// Sets the learning rates and the like of the step that comes next.
+    pub fn set_rates(&mut self) -> Result<(), Error> {
+        for (name, value) in Rates::at(&self.optim, self.step).inputs() {
+            self.set(name, &[value as f32])?;
+        }
+        self.set_u32(STEP, &[self.step as u32])
+    }
+
+    /// One step of the training program.
+    pub fn train(&mut self, program: ProgramId) -> Result<(), Error> {
+        self.set_rates()?;
+        self.session.run(program)?;
+        self.step += 1;
+        Ok(())
+    }
+
+    /// Runs a program that trains nothing, at the current progress.
+    pub fn run(&mut self, program: ProgramId) -> Result<(), Error> {
+        self.set_rates()?;
+        Ok(self.session.run(program)?)
+    }
+
+    pub fn read(&mut self, program: ProgramId, output: &str) -> Result<Vec<f32>, Error> {
+        Ok(self.session.read(program, output)?)
+    }
+
+    /// The loss terms that a program has put out.
+    pub fn losses(&mut self, program: ProgramId) -> Result<BTreeMap<String, f64>, Error> {
+        let mut loss = BTreeMap::new();
+        for name in ["render", "alignment", "total"] {
+            if self.program(program).outputs.iter().any(|(n, _)| n == name) {
+                let value = f64::from(self.read(program, name)?[0]);
+                self.check_finite(name, &[value])?;
+                loss.insert(name.to_string(), value);
+            }
+        }
+        Ok(loss)
+    }
+
+    pub fn check_finite(&self, what: &str, values: &[f64]) -> Result<(), Error> {
+        match values.iter().all(|v| v.is_finite()) {
+            true => Ok(()),
+            false => Err(Error::NotFinite { what: what.to_string(), step: self.step }),
+        }
+    }
+
+    /// Everything that carries over to the next step.
+    pub fn tensors(&mut self) -> Result<BTreeMap<String, Saved>, Error> {
+        let mut tensors = BTreeMap::new();
+        for (name, shape) in self.checkpoint_shapes() {
+            let values = self.session.get(&name)?;
+            tensors.insert(name, Saved { shape, values });
+        }
+        Ok(tensors)
+    }
+
+    /// Names and shapes of what a checkpoint holds.
+    pub fn checkpoint_shapes(&self) -> BTreeMap<String, Vec<usize>> {
+        let carried = self.inputs.iter().filter(|(_, i)| matches!(i.role, Role::Parameter | Role::State));
+        carried.map(|(name, i)| (name.clone(), dimensions(&i.shape))).collect()
+    }
+
+    /// Continues from a checkpoint, whose shapes have been checked.
+    pub fn restore(&mut self, checkpoint: &Checkpoint) -> Result<(), Error> {
+        for (name, saved) in &checkpoint.tensors {
+            self.session.set(name, &saved.values)?;
+        }
+        self.step = checkpoint.step;
+        Ok(())
+    }
+
+    /// The device, for people.
+    pub fn device_name(&self) -> String {
+        match &self.device {
+            Device::Cpu { pool } => format!("CPU, {} threads", pool.current_num_threads()),
+            #[cfg(feature = "wgpu")]
+            Device::Wgpu { gpu } => gpu.adapter().name.clone(),
+        }
+    }
+}
+
+/// -10 log10 of a mean squared error; a perfect picture has no finite PSNR, and JSON no infinity.
+pub fn psnr(mean_squared_error: f64) -> f64 {
+    -10.0 * mean_squared_error.max(1e-20).log10()
+}
+
+/// Sizes of the axes, then of the channels.
+fn dimensions(shape: &Shape) -> Vec<usize> {
+    let mut sizes: Vec<usize> = shape.axes.iter().map(|a| a.size()).collect();
+    match shape.channels {
+        Channels::Vector(n) => sizes.push(n),
+        Channels::Matrix(rows, columns) => sizes.extend([rows, columns]),
+    }
+    sizes
+}

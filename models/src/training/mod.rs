@@ -1,0 +1,75 @@
+//! What every experiment's training has in common: the optimiser as a graph, a device with programs and their inputs, and
+//! what a run asks of it.
+
+pub mod learner;
+pub mod optimise;
+
+pub use learner::Learner;
+pub use optimise::Rates;
+
+use crate::Error;
+use crate::config::Layered;
+use crate::run::checkpoint::Checkpoint;
+use crate::run::metrics::{Entry, Final, Metrics};
+use crate::run::{RunFolder, checkpoint::Saved};
+use std::collections::BTreeMap;
+
+/// An experiment in training, as a run sees it.
+pub trait Training {
+    fn learner(&self) -> &Learner;
+    fn learner_mut(&mut self) -> &mut Learner;
+
+    /// One training step. On a GPU this only submits it.
+    fn step(&mut self) -> Result<(), Error>;
+
+    /// Losses and errors of the last step, as its forward pass saw them.
+    fn measure(&mut self) -> Result<Entry, Error>;
+
+    /// Floating-point operations of a step: six a weight and row of every network.
+    fn flops(&self) -> f64;
+
+    /// Launches of a step.
+    fn launches(&self) -> usize;
+
+    /// Points of a patch, or rays, in one step.
+    fn rows(&self) -> usize;
+
+    /// The same for people: "448 points a patch".
+    fn work(&self) -> String;
+
+    /// Writes what the run learns from, before it begins.
+    fn write_data(&self, folder: &RunFolder) -> Result<(), Error>;
+
+    /// Writes one frame of the animation.
+    fn write_frame(&mut self, folder: &RunFolder) -> Result<(), Error>;
+
+    /// Measures everything at the end of the last step into `metrics`, with the `seconds` that training took, and writes the
+    /// results.
+    fn finish(
+        &mut self,
+        folder: &RunFolder,
+        layered: &Layered,
+        metrics: &mut Metrics,
+        seconds: &dyn Fn() -> f64,
+    ) -> Result<(), Error>;
+
+    /// The headline numbers as lines of text.
+    fn summary(&self, last: &Final) -> String;
+
+    /// Waits until the last step is done.
+    fn wait(&mut self) -> Result<(), Error>;
+
+    fn steps_done(&self) -> usize {
+        self.learner().steps_done()
+    }
+
+    /// Everything that carries over to the next step.
+    fn tensors(&mut self) -> Result<BTreeMap<String, Saved>, Error> {
+        self.learner_mut().tensors()
+    }
+
+    /// Continues from a checkpoint, whose shapes have been checked.
+    fn restore(&mut self, checkpoint: &Checkpoint) -> Result<(), Error> {
+        self.learner_mut().restore(checkpoint)
+    }
+}

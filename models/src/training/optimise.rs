@@ -1,0 +1,80 @@
+//! Adam on field and warp, and the values of one step that the host sets: learning rates, Adam's bias corrections, progress,
+//! step number.
+//!
+//! lr(it) = lr (lr_end / lr)^(it / T); progress is it / T, the state the step before left.
+
+use crate::config::Optim;
+use raygrad_compiler::autodiff::grad;
+use raygrad_compiler::functions::adam::{Adam, Moments, StepScalars};
+use raygrad_compiler::functions::mlp::Parameter;
+use raygrad_compiler::{Axis, Shape, Tensor};
+
+pub const STEP: &str = "step";
+pub const PROGRESS: &str = "progress";
+pub const LR_FIELD: &str = "lr.field";
+pub const LR_WARP: &str = "lr.warp";
+pub const BIAS1: &str = "adam.bias1";
+pub const BIAS2: &str = "adam.bias2";
+
+/// Values of step `it`, counted from 0.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rates {
+    pub progress: f64,
+    pub lr_field: f64,
+    pub lr_warp: f64,
+    pub bias1: f64,
+    pub bias2: f64,
+}
+
+impl Rates {
+    pub fn at(optim: &Optim, it: usize) -> Rates {
+        let progress = it as f64 / optim.steps as f64;
+        let decayed = |start: f64, end: f64| start * (end / start).powf(progress);
+        let (bias1, bias2) = Adam::default().bias_corrections(it as u64 + 1);
+        Rates {
+            progress,
+            lr_field: decayed(optim.lr, optim.lr_end),
+            lr_warp: decayed(optim.lr_warp, optim.lr_warp_end),
+            bias1,
+            bias2,
+        }
+    }
+
+    /// Names and values of the inputs they are.
+    pub fn inputs(&self) -> [(&'static str, f64); 5] {
+        [
+            (PROGRESS, self.progress),
+            (LR_FIELD, self.lr_field),
+            (LR_WARP, self.lr_warp),
+            (BIAS1, self.bias1),
+            (BIAS2, self.bias2),
+        ]
+    }
+}
+
+/// What an Adam step makes of every parameter and its moments; field and warp have learning rates of their own.
+#[track_caller]
+pub fn updates(total: &Tensor, field: &[Parameter], warp: &[Parameter]) -> Vec<(Tensor, Tensor)> {
+    let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
+    let scalars = |lr| StepScalars { lr: scalar(lr), bias1: scalar(BIAS1), bias2: scalar(BIAS2) };
+    let (of_field, of_warp) = (scalars(LR_FIELD), scalars(LR_WARP));
+    let all: Vec<(&Tensor, &StepScalars)> =
+        (field.iter().map(|p| (&p.tensor, &of_field))).chain(warp.iter().map(|p| (&p.tensor, &of_warp))).collect();
+    let gradients = grad(total, &all.iter().map(|(p, _)| *p).collect::<Vec<_>>());
+    let mut updates = vec![];
+    for ((parameter, scalars), gradient) in all.into_iter().zip(&gradients) {
+        let old = Moments::of(parameter);
+        let (value, new) = Adam::default().update(parameter, gradient, &old, scalars);
+        updates.extend([(parameter.clone(), value), (old.m, new.m), (old.v, new.v)]);
+    }
+    updates
+}
+
+/// Makes the first frame's row of `parameter` zero after the step: it fixes the gauge. Its moments go on.
+#[track_caller]
+pub fn hold_first(updates: &mut [(Tensor, Tensor)], parameter: &Tensor, frame: &Axis) {
+    let first = Tensor::index(frame).equal(&Tensor::integers(&[0]));
+    for (_, value) in updates.iter_mut().filter(|(input, _)| input.id() == parameter.id()) {
+        *value = first.select(&Tensor::scalar(0.0), value);
+    }
+}
