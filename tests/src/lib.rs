@@ -7,6 +7,7 @@ pub mod graphs;
 pub mod mistakes;
 pub mod plan;
 pub mod planar;
+pub mod rendering;
 pub mod vectors;
 
 use raygrad_compiler::autodiff::grad;

@@ -146,6 +146,19 @@ fn value(
             let inside = (0..size as i64).contains(&from);
             if inside { at(0, (e as i64 - by * step as i64) as usize, c) } else { Lane::F(0.0) }
         }),
+        RegionOp::RowReduce(kind) => {
+            let axis = region.inner.as_ref().expect("a reduction inside tiles has an inner axis");
+            let line = shape.clone().with_axes(shape.axes.union(&Axes::new([axis.clone()])));
+            let (step, size) = (stride(&line.axes, axis), axis.size());
+            Array::from_fn(shape, |e, c| {
+                let start = e / step * step * size + e % step;
+                let terms = (0..size).map(|p| inputs[0].at(inputs[0].element_of(&line, start + p * step), c).f());
+                Lane::F(match kind {
+                    Reduction::Sum => terms.sum(),
+                    Reduction::Max => terms.fold(f64::NEG_INFINITY, f64::max),
+                })
+            })
+        }
         RegionOp::Index(axis) => {
             let step = stride(&shape.axes, axis);
             Array::from_fn(shape, |e, _| Lane::U((e / step % axis.size()) as u32))

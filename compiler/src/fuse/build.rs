@@ -113,7 +113,7 @@ impl Builder {
     /// Whether `t`, needed by the region `key`, is read from memory.
     fn loads(&self, t: &Tensor, key: &Key) -> bool {
         let info = self.cuts.get(t);
-        if info.form == Form::Input {
+        if info.form == Form::Input || info.reduces_line() && info.depth < key.depth {
             return true;
         }
         if self.stored.contains(&t.id()) && (info.key() != *key || info.reduces) {
@@ -156,10 +156,9 @@ impl Builder {
             if earlier {
                 let info = &self.cuts.nodes[&id];
                 let width = info.tensor.width();
-                let shapes: Vec<_> = info.operands.iter().map(|o| o.shape().clone()).collect();
-                let flops = info.tensor.op().flops(&shapes, info.tensor.shape());
                 let target = &self.cuts.target;
-                let costly = flops > target.recompute_flops * width as u64;
+                // A copy has no buffer of its own: what follows a stored reduction is computed again.
+                let costly = info.copy_of.is_none() && self.cuts.is_costly(info);
                 // Wide values are stored as long as there is room; over few elements they take none worth mentioning.
                 let bytes = 4 * info.tensor.shape().lanes();
                 let narrow = width <= target.store_channels || bytes <= target.store_free_bytes;
@@ -192,6 +191,9 @@ impl Builder {
                 let through_memory = self.cuts.stored_for(&self.cuts.nodes[&id], i);
                 if through_memory || self.loads(&operand, key) {
                     loads.insert(operand.id());
+                    if let Some(reduction) = self.cuts.get(&operand).copy_of.clone() {
+                        self.store(&reduction);
+                    }
                 } else if computes.insert(operand.id()) {
                     stack.push(operand.id());
                 }
@@ -206,8 +208,11 @@ impl Builder {
             stores: vec![],
         };
         let mut values: HashMap<u64, InstId> = HashMap::new();
-        for id in loads.iter().chain(computes.iter()).copied().collect::<BTreeSet<u64>>() {
-            let tensor = self.cuts.nodes[&id].tensor.clone();
+        let mut all: Vec<u64> = loads.union(&computes).copied().collect();
+        all.sort_by_key(|id| self.cuts.nodes[id].rank());
+        for id in all {
+            let info = &self.cuts.nodes[&id];
+            let tensor = info.copy_of.as_ref().unwrap_or(&info.tensor).clone();
             if loads.contains(&id) && !computes.contains(&id) {
                 let buffer = self.buffer(&tensor);
                 values.insert(id, push(&mut region, &tensor, RegionOp::Load(buffer), vec![]));
@@ -215,7 +220,8 @@ impl Builder {
                 self.compute(&mut region, &mut values, id, ids.contains(&id));
             }
         }
-        (region, computes.into_iter().collect())
+        let originals: BTreeSet<u64> = computes.iter().map(|id| self.cuts.nodes[id].rank().0).collect();
+        (region, originals.into_iter().collect())
     }
 
     /// Adds node `id` to a region: its instruction, and its store if it is one of the region's results.
@@ -288,7 +294,11 @@ impl Builder {
                 return self.write(region, values, &t, stored);
             }
             Form::SymEig { n } => RegionOp::SymEig { n },
-            Form::Input | Form::Reduce(_) | Form::Scatter { .. } => {
+            Form::Reduce(kind) => {
+                region.whole = true;
+                RegionOp::RowReduce(kind)
+            }
+            Form::Input | Form::Scatter { .. } => {
                 unreachable!("loads and reductions are handled above")
             }
         };
@@ -329,6 +339,7 @@ fn push(region: &mut Region, t: &Tensor, op: RegionOp, inputs: Vec<InstId>) -> I
         RegionOp::RowLinear { .. } | RegionOp::RowOuter | RegionOp::SymEig { .. } => along(&Axes::none()),
         RegionOp::Linear(_) => along(t.inputs()[1].axes()),
         RegionOp::Take { axis, .. } => along(&t.inputs()[0].axes().without(axis)),
+        RegionOp::RowReduce(_) => region.inner.iter().fold(along(&Axes::none()), |axes, inner| axes.without(inner)),
         RegionOp::Load(_) | RegionOp::Const(_) | RegionOp::Index(_) => t.axes().clone(),
         RegionOp::CumSum { .. } | RegionOp::Shift { .. } => t.axes().clone(),
     };

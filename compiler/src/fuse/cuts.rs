@@ -1,10 +1,11 @@
 //! Domains, free values, forced cuts and depths.
 
+use super::lines::{self, Copies};
 use super::{Target, TargetKind};
 use crate::graph::{Axes, Axis, Tensor, topological};
 use crate::ops::Form;
 use crate::plan::region::Grain;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 /// Channels from which a value counts as wide on a GPU.
 const WIDE: usize = 65;
@@ -27,6 +28,8 @@ pub(super) fn resolve(t: &Tensor) -> Tensor {
 /// What fusion knows of a node.
 pub(super) struct Info {
     pub tensor: Tensor,
+    /// Of a copy inside the tiles of a region (see [`lines`]): what it is a copy of.
+    pub copy_of: Option<Tensor>,
     pub form: Form,
     pub domain: Axes,
     /// The axis its region's tiles run along.
@@ -48,6 +51,14 @@ impl Info {
     /// Regions are nodes of equal keys.
     pub fn key(&self) -> Key {
         Key { depth: self.depth, domain: self.domain.clone(), inner: self.inner.clone(), grain: self.grain }
+    }
+    /// Order of instructions: a copy comes just before its original.
+    pub fn rank(&self) -> (u64, bool) {
+        (self.copy_of.as_ref().unwrap_or(&self.tensor).id(), self.copy_of.is_none())
+    }
+    /// Whether it is a reduction that is complete inside a tile.
+    pub fn reduces_line(&self) -> bool {
+        self.copy_of.is_some() && matches!(self.form, Form::Reduce(_))
     }
     /// Whether the weights of a layer (operand 1) are the same along the inner axis.
     pub fn shared_weights(&self) -> bool {
@@ -77,29 +88,59 @@ pub(super) struct Cuts {
     /// Identifiers in topological order.
     pub order: Vec<u64>,
     pub target: Target,
+    copies: Copies,
 }
 
 impl Cuts {
     pub fn new(roots: &[Tensor], target: Target) -> Cuts {
-        let mut cuts = Cuts { nodes: HashMap::new(), order: vec![], target };
-        let is_root = |t: &Tensor| roots.iter().any(|r| r.id() == t.id());
-        for t in topological(roots.iter().cloned()) {
-            // An identity is a node only if it must be written as such.
-            if t.op().form() != Form::Identity || is_root(&t) {
-                let info = cuts.inspect(&t);
-                cuts.order.push(t.id());
-                cuts.nodes.insert(t.id(), info);
-            }
+        let mut cuts = Cuts { nodes: HashMap::new(), order: vec![], target, copies: Copies::default() };
+        cuts.inspect_all(roots);
+        cuts.copies = lines::find(&cuts);
+        if !cuts.copies.is_empty() {
+            cuts.inspect_all(roots);
+            cuts.keep_needed(roots);
         }
         cuts.sink(roots);
         cuts
+    }
+
+    fn inspect_all(&mut self, roots: &[Tensor]) {
+        let is_root = |t: &Tensor| roots.iter().any(|r| r.id() == t.id());
+        self.order.clear();
+        for t in topological(roots.iter().cloned()) {
+            // An identity is a node only if it must be written as such.
+            if t.op().form() == Form::Identity && !is_root(&t) {
+                continue;
+            }
+            for (domain, copy) in self.copies.of(t.id()).to_vec() {
+                let info = self.inspect(&copy, Some((&t, &domain)));
+                self.order.push(copy.id());
+                self.nodes.insert(copy.id(), info);
+            }
+            let info = self.inspect(&t, None);
+            self.order.push(t.id());
+            self.nodes.insert(t.id(), info);
+        }
+    }
+
+    /// Drops nodes that only others' copies were for.
+    fn keep_needed(&mut self, roots: &[Tensor]) {
+        let mut needed: HashSet<u64> = HashSet::new();
+        let mut stack: Vec<u64> = roots.iter().map(Tensor::id).collect();
+        while let Some(id) = stack.pop() {
+            if needed.insert(id) {
+                stack.extend(self.nodes[&id].operands.iter().map(Tensor::id));
+            }
+        }
+        self.order.retain(|id| needed.contains(id));
     }
 
     pub fn get(&self, t: &Tensor) -> &Info {
         &self.nodes[&t.id()]
     }
 
-    fn inspect(&self, t: &Tensor) -> Info {
+    /// What is known of `t`, or of a copy of another node in the regions over a domain.
+    fn inspect(&self, t: &Tensor, copy: Option<(&Tensor, &Axes)>) -> Info {
         let form = t.op().form();
         let operands: Vec<Tensor> = t.inputs().iter().map(resolve).collect();
         let mut domain = t.axes().clone();
@@ -108,12 +149,16 @@ impl Cuts {
             domain = t.inputs().iter().fold(Axes::none(), |d, i| d.union(i.axes()));
             reduces = !(form == Form::Outer && domain == *t.axes());
         }
+        if let Some((_, within)) = copy {
+            (domain, reduces) = (within.clone(), false);
+        }
         let mut inner = domain.last().cloned();
         if let Form::CumSum { axis, .. } | Form::Shift { axis, .. } = &form {
             inner = Some(axis.clone());
         }
         let mut info = Info {
             tensor: t.clone(),
+            copy_of: copy.map(|(original, _)| original.clone()),
             form,
             domain,
             inner,
@@ -125,6 +170,12 @@ impl Cuts {
             depth: 0,
             closure_flops: 0,
         };
+        for i in (0..info.operands.len()).filter(|_| info.inner.as_ref() == info.domain.last()) {
+            let copy = self.copies.within(info.operands[i].id(), &info.domain);
+            if let Some(copy) = copy.filter(|_| !info.needs_buffer(i)) {
+                info.operands[i] = copy.clone();
+            }
+        }
         info.grain = self.grain(&info);
         info.by_lane = match info.form {
             Form::Input | Form::Const(_) | Form::Index { .. } | Form::Take { .. } => true,
@@ -163,6 +214,13 @@ impl Cuts {
             info.depth = 0;
         }
         info
+    }
+
+    /// Whether computing a node again is not cheap.
+    pub fn is_costly(&self, info: &Info) -> bool {
+        let shapes: Vec<_> = info.operands.iter().map(|o| o.shape().clone()).collect();
+        let flops = info.tensor.op().flops(&shapes, info.tensor.shape());
+        flops > self.target.recompute_flops * info.tensor.width() as u64
     }
 
     /// GPU: layers with the pointwise values after them, and wide values, work lane by lane, everything else row by row.

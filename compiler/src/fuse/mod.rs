@@ -5,12 +5,16 @@
 //! weights, between domains, and, on a GPU, around wide layers. Nodes of one depth and domain form one region. Values
 //! that are cheap to get from inputs are *free*: every region that needs them computes them itself.
 //!
+//! On a CPU a reduction over exactly the inner axis is also complete inside a tile that holds the whole axis, and what goes
+//! back from it into the same domain needs no cut (see [`lines`]).
+//!
 //! What a region needs from an earlier region of the same domain is either stored or computed again: the fewest channels
 //! are stored that spare it from computing narrow expensive values again; wide ones are recomputed (see
 //! [`Target::store_channels`]).
 
 mod build;
 mod cuts;
+mod lines;
 mod merge;
 mod store;
 
@@ -31,6 +35,12 @@ pub struct Target {
     pub recompute_flops: u64,
     /// Operations per element up to which values computed from inputs alone are free.
     pub free_flops: u64,
+    /// Longest inner axis that is one tile in any case: reductions along it stay inside a tile; 0 where they never do.
+    pub tile_rows: usize,
+    /// Longest inner axis that becomes one tile for them if there are ...
+    pub line_rows: usize,
+    /// ... at least this many positions of the outer axes, so that there are still tiles for every thread.
+    pub lines: usize,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -50,6 +60,9 @@ impl Target {
             store_bytes: 192 << 20,
             recompute_flops: 64,
             free_flops: 600,
+            tile_rows: 192,
+            line_rows: 1024,
+            lines: 16,
         }
     }
     pub fn gpu() -> Target {
@@ -60,6 +73,9 @@ impl Target {
             store_bytes: 0,
             recompute_flops: 16,
             free_flops: 600,
+            tile_rows: 0,
+            line_rows: 0,
+            lines: 0,
         }
     }
 }

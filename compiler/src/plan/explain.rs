@@ -12,7 +12,7 @@ pub(super) fn launch_name(index: usize, region: &Region) -> String {
     let kind = |op: &RegionOp| match op {
         RegionOp::Linear(_) | RegionOp::RowLinear { .. } => 5,
         RegionOp::SymEig { .. } => 4,
-        RegionOp::CumSum { .. } | RegionOp::Shift { .. } => 3,
+        RegionOp::CumSum { .. } | RegionOp::Shift { .. } | RegionOp::RowReduce(_) => 3,
         RegionOp::Map(_) => 2,
         _ => 1,
     };

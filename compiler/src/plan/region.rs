@@ -58,6 +58,8 @@ pub enum RegionOp {
     Shift {
         by: i64,
     },
+    /// Reduction over the inner axis: the same for all positions along it. Only on a CPU.
+    RowReduce(Reduction),
     /// Position along an axis of the domain.
     Index(Axis),
     /// The table's element at operand 0 along `axis`, clamped to the last one.
@@ -140,7 +142,7 @@ pub struct Region {
     pub domain: Axes,
     /// The axis that tiles run along: the last of the domain unless a scan needs another. `None` for a domain of one element.
     pub inner: Option<Axis>,
-    /// Whether a scan needs the whole inner axis in one tile.
+    /// Whether a scan or a reduction inside the tile needs the whole inner axis in one tile.
     pub whole: bool,
     pub grain: Grain,
     pub body: Vec<Inst>,
@@ -185,6 +187,7 @@ impl Region {
                 RegionOp::RowLinear { rows, columns, .. } => 2 * (rows * columns) as u64,
                 RegionOp::SymEig { n } => 60 * (n * n * n) as u64,
                 RegionOp::ChannelSum(g) => g.iter().map(|g| g.len() as u64).sum(),
+                RegionOp::RowReduce(_) => width * self.inner.as_ref().map_or(1, Axis::size) as u64,
                 RegionOp::RowOuter | RegionOp::ChannelMax | RegionOp::CumSum { .. } => width,
                 _ => 0,
             };

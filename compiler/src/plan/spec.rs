@@ -2,6 +2,7 @@
 
 use super::region::{RegionOp, Store};
 use super::{BufferKind, Program};
+use crate::fuse::TargetKind;
 
 /// Panics, in debug builds only, if the compiler built a program that breaks its own rules.
 pub(super) fn check(program: &Program) {
@@ -44,6 +45,11 @@ fn verify(program: &Program) -> Result<(), String> {
                     inst.inputs.get(*o as usize).is_some_and(|x| (*c as usize) < region.inst(*x).channels)
                 }),
                 RegionOp::CumSum { .. } | RegionOp::Shift { .. } => region.whole,
+                RegionOp::RowReduce(_) => {
+                    let channels = region.inst(inst.inputs[0]).channels;
+                    let uniform = region.inner.as_ref().is_some_and(|a| !inst.axes.contains(a));
+                    region.whole && uniform && channels == inst.channels && program.target.kind == TargetKind::Cpu
+                }
                 _ => true,
             };
             if !fits {

@@ -142,6 +142,7 @@ impl<'r> Values<'r> {
                 None => unreachable!("scans are given by the kernel that runs along their axis"),
             },
             RegionOp::Shift { by } => self.shift(e, id, *by, channel),
+            RegionOp::RowReduce(_) => unreachable!("on a GPU every reduction ends its region"),
         }
     }
 

@@ -70,11 +70,12 @@ impl Builder {
         }
         match self.rng.below(100) {
             0..8 => self.input_node(),
-            8..20 => self.unary(),
-            20..34 => self.binary(),
-            34..38 => self.kink(),
-            38..50 => self.channels(),
-            50..64 => self.layer(),
+            8..17 => self.unary(),
+            17..29 => self.binary(),
+            29..33 => self.kink(),
+            33..44 => self.channels(),
+            44..55 => self.layer(),
+            55..64 => self.line(),
             64..68 => self.product(),
             68..76 => self.reduction(),
             76..80 => self.scan(),

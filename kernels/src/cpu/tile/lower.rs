@@ -184,6 +184,11 @@ impl Lowering<'_> {
                 });
                 copy.into_iter().for_each(|c| self.values.release_temporary(c));
             }
+            RegionOp::RowReduce(kind) => {
+                let x = self.values.get(inst.inputs[0]).clone();
+                let out = self.values.create(id, inst.channels, false);
+                self.out.ops.push(TileOp::RowReduce { kind: *kind, x, out });
+            }
             RegionOp::Index(axis) => {
                 let outer = self.outer.iter().position(|a| *a == axis);
                 let out = self.values.create(id, 1, full);

@@ -172,6 +172,12 @@ pub enum TileOp {
         out: Place,
         by: i64,
     },
+    /// Reduction over the tile's rows, one lane a channel.
+    RowReduce {
+        kind: Reduction,
+        x: Value,
+        out: Place,
+    },
     /// Position along an outer axis (by index) or the inner one.
     Index {
         outer: Option<usize>,

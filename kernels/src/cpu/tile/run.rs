@@ -173,6 +173,11 @@ impl Tile<'_> {
                 }
                 TileOp::CumSum { from, out, reverse } => self.cumsum(from, *out, *reverse),
                 TileOp::Shift { from, out, by } => self.shift(from, *out, *by),
+                TileOp::RowReduce { kind, x, out } => {
+                    for c in 0..x.places.len() {
+                        *self.at(*out).add(c) = self.total(*kind, x, c);
+                    }
+                }
                 TileOp::Index { outer, out } => {
                     let out = self.at(*out);
                     match outer {
@@ -496,18 +501,31 @@ impl Tile<'_> {
                     for r in 0..self.rows {
                         combine(to.add(r * view.inner), self.lane(value, c, r));
                     }
-                } else if value.full {
-                    let mut total = if kind == Reduction::Sum { 0.0 } else { f32::NEG_INFINITY };
-                    let x = self.at(value.places[c]);
-                    match kind {
-                        Reduction::Sum => rows_sum(self.isa, x, self.program.ld, 1, self.rows, &mut total),
-                        Reduction::Max => rows_max(self.isa, x, self.program.ld, 1, self.rows, &mut total),
-                    }
-                    combine(to, total);
                 } else {
-                    let x = self.lane(value, c, 0);
-                    combine(to, if kind == Reduction::Sum { x * self.rows as f32 } else { x });
+                    combine(to, self.total(kind, value, c));
                 }
+            }
+        }
+    }
+
+    /// Reduction of a channel over the tile's rows; a uniform one counts for every row.
+    unsafe fn total(&self, kind: Reduction, value: &Value, channel: usize) -> f32 {
+        let (x, ld) = (self.at(value.places[channel]), self.program.ld);
+        // SAFETY: `rows` lanes of a channel in the scratch, or the one of a uniform value.
+        unsafe {
+            match kind {
+                Reduction::Sum if value.full => {
+                    let mut total = 0.0;
+                    rows_sum(self.isa, x, ld, 1, self.rows, &mut total);
+                    total
+                }
+                Reduction::Max if value.full => {
+                    let mut total = f32::NEG_INFINITY;
+                    rows_max(self.isa, x, ld, 1, self.rows, &mut total);
+                    total
+                }
+                Reduction::Sum => *x * self.rows as f32,
+                Reduction::Max => *x,
             }
         }
     }
