@@ -1,4 +1,5 @@
-//! Depth maps as pictures: inverse depth in the inferno colours, as the published videos have them.
+//! Depth maps as pictures: inverse depth in the inferno colours, as the published videos have them. The crate colorous
+//! draws a smooth line through that colour map's 256 entries, so a byte may be off by one, at the bright end by four.
 
 use crate::pictures::Canvas;
 
@@ -40,14 +41,17 @@ mod tests {
     #[test]
     fn near_is_bright_and_far_is_dark() {
         let style = DepthStyle { scale: 2.0, shifted: false };
+        let near = |found: [u8; 3], entry: [u8; 3]| {
+            let close = found.iter().zip(entry).all(|(a, b)| a.abs_diff(b) <= 4);
+            assert!(close, "{found:?} instead of {entry:?}");
+        };
+        // Entries 255, 63, 0 and 0 of the published colour map; the second is floor(255 / (1 / 0.5 * 2)).
         let canvas = inverse_depth(4, 1, &[0.25, 1.0, 1e9, f32::NAN], &[1.0, 0.5, 1.0, 1.0], style);
-        let pixels: Vec<[u8; 3]> = canvas.0.pixels().map(|p| p.0).collect();
-        // The ends of the published colour map, and its entry 63: inverse depth 1 / (1 / 0.5 * 2).
-        assert_eq!(pixels[0], [252, 255, 164]);
-        assert_eq!(pixels[1], colorous::INFERNO.eval_rational(63, 256).as_array());
-        assert_eq!((pixels[2], pixels[3]), ([0, 0, 4], [0, 0, 4]));
+        let entries = [[0xfc, 0xff, 0xa4], [0x55, 0x0f, 0x6d], [0x00, 0x00, 0x04], [0x00, 0x00, 0x04]];
+        canvas.0.pixels().zip(entries).for_each(|(p, e)| near(p.0, e));
+        // Shifted by 1.5, and not below one: entries 255 and 127.
         let shifted = inverse_depth(2, 1, &[2.0, 3.5], &[1.0; 2], DepthStyle { scale: 1.0, shifted: true });
-        assert_eq!(shifted.0.get_pixel(0, 0).0, [252, 255, 164]);
-        assert_eq!(shifted.0.get_pixel(1, 0).0, colorous::INFERNO.eval_rational(127, 256).as_array());
+        near(shifted.0.get_pixel(0, 0).0, [0xfc, 0xff, 0xa4]);
+        near(shifted.0.get_pixel(1, 0).0, [0xba, 0x36, 0x55]);
     }
 }
