@@ -32,6 +32,7 @@
 pub mod config;
 pub mod data;
 mod error;
+pub mod evaluation;
 mod experiment;
 pub mod fields;
 pub mod geometry;

@@ -9,6 +9,11 @@ const LAST: u16 = 2000;
 
 /// All frames as one picture; they have the size of the first.
 pub fn animate(frames: &[Canvas]) -> Result<Vec<u8>, PictureError> {
+    animate_at(frames, FRAME, LAST)
+}
+
+/// The same, with the milliseconds a frame is shown, and the last one.
+pub fn animate_at(frames: &[Canvas], shown: u16, last_shown: u16) -> Result<Vec<u8>, PictureError> {
     let Some(first) = frames.first() else {
         return Err(PictureError("an animation needs at least one frame".to_string()));
     };
@@ -20,7 +25,7 @@ pub fn animate(frames: &[Canvas]) -> Result<Vec<u8>, PictureError> {
         encoder.set_animated(frames.len() as u32, 0)?;
         let mut writer = encoder.write_header()?;
         for (i, frame) in frames.iter().enumerate() {
-            writer.set_frame_delay(if i + 1 == frames.len() { LAST } else { FRAME }, 1000)?;
+            writer.set_frame_delay(if i + 1 == frames.len() { last_shown } else { shown }, 1000)?;
             writer.write_image_data(frame.0.as_raw())?;
         }
         writer.finish()

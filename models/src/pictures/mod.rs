@@ -4,7 +4,7 @@ mod animation;
 mod canvas;
 mod planar;
 
-pub use animation::animate;
+pub use animation::{animate, animate_at};
 pub use canvas::{Canvas, PATCH_COLORS, patch_color};
 pub use planar::{View, outlined, patch_row, tile, warp_field};
 

@@ -1,0 +1,28 @@
+//! What a 3D run is measured by and leaves to look at, on the host in f64: poses against a reference, pictures against
+//! photos, meshes, exports and tables in the papers' layout. Nothing here needs a trainer or a loader; poses are
+//! [`Pose`](crate::geometry::Pose)s, pictures lists of colours.
+//!
+//! Of the same quantity the published programs compute more than one version; each function says whose it is.
+
+mod align;
+mod chamfer;
+mod depth_pictures;
+mod export;
+mod image_metrics;
+mod lpips;
+mod mesh;
+mod mesh_files;
+mod novel_path;
+mod pose_error;
+mod video;
+
+pub use align::{Alignment, PoseSetError, Similarity, pairwise, procrustes, umeyama};
+pub use chamfer::{Chamfer, CloudError, chamfer};
+pub use depth_pictures::{DepthStyle, inverse_depth};
+pub use export::{Camera, Colmap, ExportError, poses_bounds, transforms_json};
+pub use image_metrics::{DepthErrors, ImageError, Picture, depth_errors, mse, psnr, released_depth_errors, ssim};
+pub use lpips::{Lpips, WeightsError};
+pub use mesh::{DensityError, Mesh, MeshError, MeshOptions};
+pub use novel_path::{FRAMES, anchor, novel_view_path};
+pub use pose_error::{PoseErrors, pose_errors, rotation_angle};
+pub use video::{Video, VideoError, write_video, write_video_with};
