@@ -39,6 +39,7 @@ pub mod pictures;
 pub mod planar;
 pub mod report;
 pub mod run;
+pub mod scene;
 pub mod testing;
 pub mod warps;
 
