@@ -41,6 +41,7 @@ pub mod planar;
 pub mod radiance;
 pub mod report;
 pub mod run;
+pub mod scene;
 pub mod testing;
 pub mod training;
 pub mod warps;
