@@ -1,8 +1,10 @@
 //! Everything that can end an experiment early.
 
 use crate::config::ConfigError;
+use crate::evaluation::ImageError;
 use crate::pictures::PictureError;
 use crate::planar::DataError;
+use crate::radiance::data::SpaceDataError;
 use crate::report::PlotError;
 use crate::run::files::WriteError;
 use crate::run::{CheckpointError, FolderError};
@@ -15,6 +17,10 @@ pub enum Error {
     Config(#[from] ConfigError),
     #[error(transparent)]
     Data(#[from] DataError),
+    #[error(transparent)]
+    Space(#[from] SpaceDataError),
+    #[error(transparent)]
+    Image(#[from] ImageError),
     #[error(transparent)]
     Device(#[from] DeviceError),
     #[error(transparent)]
@@ -40,7 +46,12 @@ impl Error {
     pub fn is_bad_input(&self) -> bool {
         !matches!(
             self,
-            Error::Picture(_) | Error::Plot(_) | Error::Compile(_) | Error::Run(_) | Error::NotFinite { .. }
+            Error::Picture(_)
+                | Error::Image(_)
+                | Error::Plot(_)
+                | Error::Compile(_)
+                | Error::Run(_)
+                | Error::NotFinite { .. }
         )
     }
 }

@@ -12,6 +12,7 @@
 use crate::Error;
 use crate::config::{ConfigError, DeviceChoice, Layered, Origin};
 use crate::planar::{PlanarData, Trainer};
+use crate::radiance::{Explorer, SpaceData};
 use crate::run::RunFolder;
 use crate::run::checkpoint::Checkpoint;
 use crate::run::metrics::{Entry, Metrics};
@@ -118,6 +119,9 @@ impl Experiment {
 
     /// Checks everything, compiles, and fills the device: an experiment before its first step.
     pub fn training(&self) -> Result<Box<dyn Training>, Error> {
+        if self.layered.settings.scene.is_some() {
+            return Ok(Box::new(self.explorer()?));
+        }
         Ok(Box::new(self.trainer()?))
     }
 
@@ -126,12 +130,25 @@ impl Experiment {
         self.layered.validate()?;
         let settings = &self.layered.settings;
         let data = PlanarData::load(&self.layered)?;
-        let device = match &self.device {
-            Some(device) => device.clone(),
-            None => open_device(settings.run.device, settings.run.threads.limit())?,
-        };
         let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings));
-        Trainer::new(settings, data, warp, device)
+        Trainer::new(settings, data, warp, self.open()?)
+    }
+
+    /// The same for an experiment in space.
+    pub fn explorer(&self) -> Result<Explorer, Error> {
+        self.layered.validate()?;
+        let settings = &self.layered.settings;
+        let data = SpaceData::load(&self.layered, &|_, _| {})?;
+        let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings));
+        Explorer::new(settings, data, warp, self.open()?)
+    }
+
+    fn open(&self) -> Result<Device, Error> {
+        let run = &self.layered.settings.run;
+        match &self.device {
+            Some(device) => Ok(device.clone()),
+            None => Ok(open_device(run.device, run.threads.limit())?),
+        }
     }
 
     /// Trains until the last step is done or `stop` is set, which ends the run with a checkpoint.

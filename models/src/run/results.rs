@@ -11,7 +11,7 @@ use crate::report::{Picture, Report};
 use crate::training::Training;
 
 /// Folder of the animation's frames, one PNG a step number.
-const FRAMES: &str = "frames";
+pub(crate) const FRAMES: &str = "frames";
 
 /// What the run learns from, before it begins.
 pub fn write_data(folder: &RunFolder, settings: &Settings, data: &PlanarData) -> Result<(), Error> {
@@ -103,7 +103,7 @@ pub fn write_results(
 }
 
 /// The frames up to the given step as one animated picture.
-fn animation(folder: &RunFolder, last: usize) -> Result<Option<Vec<u8>>, Error> {
+pub(crate) fn animation(folder: &RunFolder, last: usize) -> Result<Option<Vec<u8>>, Error> {
     let mut frames: Vec<(usize, std::path::PathBuf)> = vec![];
     for entry in std::fs::read_dir(folder.path().join(FRAMES)).into_iter().flatten().flatten() {
         let path = entry.path();

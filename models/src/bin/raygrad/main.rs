@@ -48,6 +48,9 @@ struct Choice {
     /// PNG or JPEG file to take the patches from, instead of the built-in photo.
     #[arg(long, value_name = "FILE")]
     image: Option<String>,
+    /// Folder of a scene, for experiments in space.
+    #[arg(long, value_name = "DIR")]
+    data: Option<String>,
     /// Seed of perturbation, initial weights and pixel draws.
     #[arg(long, value_name = "N")]
     seed: Option<String>,
@@ -68,6 +71,7 @@ impl Choice {
         }
         let options = [
             ("--image", "data.image", &self.image),
+            ("--data", "scene.path", &self.data),
             ("--seed", "run.seed", &self.seed),
             ("--device", "run.device", &self.device),
             ("--threads", "run.threads", &self.threads),

@@ -1,0 +1,252 @@
+//! A 3D model on a device: its programs, their inputs, and steps.
+
+use super::data::{SpaceData, SpaceDataError};
+use super::model::{self, RadianceModel, nothing_found};
+use super::results::{self, Scores};
+use crate::Error;
+use crate::config::{DepthSettings, Layered, Settings};
+use crate::evaluation::{pose_errors, procrustes};
+use crate::geometry::Pose;
+use crate::run::RunFolder;
+use crate::run::metrics::{Entry, Final, Measured, Metrics};
+use crate::scene::Intrinsics;
+use crate::training::learner::psnr;
+use crate::training::{Learner, Training};
+use crate::warps::Warp;
+use raygrad_compiler::Program;
+use raygrad_compiler::functions::adam::Adam;
+use raygrad_runtime::{Device, ProgramId};
+use std::sync::Arc;
+
+/// Pixels that one run of the rendering program covers, at most.
+const VIEW_PIXELS: usize = 2048;
+/// Points that one run of the density program covers.
+const MESH_POINTS: usize = 4096;
+
+/// A model in training.
+pub struct Explorer {
+    pub data: SpaceData,
+    settings: Settings,
+    learner: Learner,
+    train: ProgramId,
+    view: ProgramId,
+    refine: ProgramId,
+    densities: ProgramId,
+    /// Pixels of one run of `view`.
+    view_pixels: usize,
+    rays: usize,
+    flops: f64,
+    /// Of the test views, once training has ended.
+    scores: Option<Scores>,
+}
+
+/// A view as the model sees it, row by row.
+#[derive(Clone, Debug)]
+pub struct Rendered {
+    pub rgb: Vec<f32>,
+    /// Expected depth, not divided by the opacity.
+    pub depth: Vec<f32>,
+    pub opacity: Vec<f32>,
+}
+
+impl Explorer {
+    /// Compiles the programs and fills their inputs.
+    pub fn new(settings: &Settings, data: SpaceData, warp: Arc<dyn Warp>, device: Device) -> Result<Explorer, Error> {
+        let views = data.scene.train.len();
+        let model = RadianceModel::new(settings, data.size, views, warp).map_err(SpaceDataError::from)?;
+        let view_pixels = VIEW_PIXELS.min(data.size.pixels());
+        let mut learner = Learner::new(device, &settings.optim)?;
+        let train = learner.add(&model.train_step())?;
+        let view = learner.add(&model.view(view_pixels))?;
+        let refine = learner.add(&model.refinement())?;
+        let densities = learner.add(&model.densities(MESH_POINTS))?;
+        learner.fill(&model.parameters(), settings.run.seed)?;
+        learner.set_seed(model::SEED, settings.run.seed)?;
+        let flat = |rows: Vec<[f64; 12]>| rows.concat().iter().map(|x| *x as f32).collect::<Vec<f32>>();
+        learner.set(model::POSES, &flat(data.rough.iter().map(|p| p.to_rows()).collect()))?;
+        learner.set(model::FOUND, &nothing_found(views))?;
+        let intrinsics: Vec<f32> = data.scene.train.iter().flat_map(|v| lens(&v.intrinsics)).collect();
+        learner.set(model::INTRINSICS, &intrinsics)?;
+        let images: Vec<f32> = data.scene.train.iter().flat_map(|v| v.rgb.iter().copied()).collect();
+        learner.set(model::IMAGES, &images)?;
+        let (rays, flops, settings) = (model.rays_per_view() * views, model.flops(), settings.clone());
+        Ok(Explorer { data, settings, learner, train, view, refine, densities, view_pixels, rays, flops, scores: None })
+    }
+
+    /// The program of a training step.
+    pub fn program(&self) -> &Program {
+        self.learner.program(self.train)
+    }
+
+    /// The poses of the training views, as the last step found them.
+    pub fn poses(&mut self) -> Result<Vec<Pose>, Error> {
+        let found = self.learner.session.get(model::FOUND)?;
+        Ok(self
+            .data
+            .rough
+            .iter()
+            .zip(found.chunks(12))
+            .map(|(rough, found)| rough.after(&Pose::from_rows(found)))
+            .collect())
+    }
+
+    /// The whole image of a camera in the learned world.
+    pub fn render(&mut self, pose: &Pose, intrinsics: &Intrinsics) -> Result<Rendered, Error> {
+        self.set_view(pose, intrinsics)?;
+        let pixels = self.data.size.pixels();
+        let mut seen = Rendered { rgb: vec![], depth: vec![], opacity: vec![] };
+        for first in (0..pixels).step_by(self.view_pixels) {
+            self.learner.set_u32(model::VIEW_FIRST, &[first as u32])?;
+            self.learner.run(self.view)?;
+            let left = self.view_pixels.min(pixels - first);
+            let mut read = |name, width: usize| -> Result<Vec<f32>, Error> {
+                let mut values = self.learner.read(self.view, name)?;
+                values.truncate(width * left);
+                Ok(values)
+            };
+            seen.rgb.extend(read("color", 3)?);
+            seen.depth.extend(read("depth", 1)?);
+            seen.opacity.extend(read("opacity", 1)?);
+        }
+        Ok(seen)
+    }
+
+    /// `pose` after test-time refinement against an image: `P Exp(twist)` with Adam on the twist, the field as it is.
+    pub fn refined(&mut self, pose: &Pose, intrinsics: &Intrinsics, image: &[f32]) -> Result<Pose, Error> {
+        let steps = self.settings.train.as_ref().map_or(0, |t| t.refine_steps);
+        self.set_view(pose, intrinsics)?;
+        self.learner.set(model::VIEW_IMAGE, image)?;
+        for state in [model::TWIST.to_string(), format!("adam.m.{}", model::TWIST), format!("adam.v.{}", model::TWIST)]
+        {
+            self.learner.set(&state, &[0.0; 6])?;
+        }
+        self.learner.set(model::TWIST_LR, &[self.settings.optim.lr_warp as f32])?;
+        for step in 1..=steps {
+            let (bias1, bias2) = Adam::default().bias_corrections(step as u64);
+            self.learner.set(model::TWIST_BIAS1, &[bias1 as f32])?;
+            self.learner.set(model::TWIST_BIAS2, &[bias2 as f32])?;
+            self.learner.set_rates()?;
+            self.learner.set_u32(crate::training::optimise::STEP, &[step as u32])?;
+            self.learner.session.run(self.refine)?;
+        }
+        let twist = self.learner.session.get(model::TWIST)?;
+        Ok(pose.after(&Pose::exp(&std::array::from_fn(|i| f64::from(twist[i])))))
+    }
+
+    /// Densities at points of the learned world, three numbers a point.
+    pub fn densities(&mut self, points: &[f32]) -> Result<Vec<f32>, Error> {
+        let mut all = vec![];
+        for part in points.chunks(3 * MESH_POINTS) {
+            let mut padded = part.to_vec();
+            padded.resize(3 * MESH_POINTS, 0.0);
+            self.learner.set(model::MESH_POINTS, &padded)?;
+            self.learner.run(self.densities)?;
+            let values = self.learner.read(self.densities, "density")?;
+            all.extend(&values[..part.len() / 3]);
+        }
+        Ok(all)
+    }
+
+    fn set_view(&mut self, pose: &Pose, intrinsics: &Intrinsics) -> Result<(), Error> {
+        let rows = pose.to_rows().map(|x| x as f32);
+        self.learner.set(model::VIEW_POSE, &rows)?;
+        self.learner.set(model::VIEW_INTRINSICS, &lens(intrinsics))?;
+        if self.settings.train.as_ref().is_some_and(|t| t.depth == DepthSettings::Auto) {
+            let centers: Vec<_> = self.poses()?.iter().map(Pose::center).collect();
+            let largest = centers.iter().flat_map(|a| centers.iter().map(move |b| (a - b).norm())).fold(0.0, f64::max);
+            let range = [super::rays::NEAR_PART * largest, super::rays::FAR_PART * largest];
+            self.learner.set(model::VIEW_RANGE, &range.map(|x| x as f32))?;
+        }
+        Ok(())
+    }
+}
+
+/// fx, fy, cx, cy.
+fn lens(camera: &Intrinsics) -> [f32; 4] {
+    [camera.fx, camera.fy, camera.cx, camera.cy].map(|x| x as f32)
+}
+
+impl Training for Explorer {
+    fn learner(&self) -> &Learner {
+        &self.learner
+    }
+    fn learner_mut(&mut self) -> &mut Learner {
+        &mut self.learner
+    }
+    fn step(&mut self) -> Result<(), Error> {
+        self.learner.train(self.train)
+    }
+    fn wait(&mut self) -> Result<(), Error> {
+        self.learner.read(self.train, "total")?;
+        Ok(())
+    }
+    fn measure(&mut self) -> Result<Entry, Error> {
+        let loss = self.learner.losses(self.train)?;
+        let found = self.poses()?;
+        let numbers: Vec<f64> = found.iter().flat_map(|p| p.to_rows()).collect();
+        self.learner.check_finite("a pose", &numbers)?;
+        let errors = match &self.data.truth {
+            Some(truth) if truth.len() > 1 => {
+                let poses = |e| SpaceDataError::from(e);
+                let aligned = procrustes(&found, truth).map_err(poses)?.align(&found);
+                Some(pose_errors(&aligned, truth).map_err(poses)?)
+            }
+            _ => None,
+        };
+        let measured = Measured::Space {
+            psnr_db: psnr(loss.get("render").copied().unwrap_or(1.0)),
+            rotation_error_deg: errors.as_ref().map(|e| e.mean_rotation_deg()),
+            translation_error_x100: errors.as_ref().map(|e| 100.0 * e.mean_translation()),
+        };
+        Ok(Entry { step: self.learner.steps_done(), loss, measured })
+    }
+    fn flops(&self) -> f64 {
+        self.flops
+    }
+    fn launches(&self) -> usize {
+        self.program().launches.len()
+    }
+    fn rows(&self) -> usize {
+        self.rays
+    }
+    fn work(&self) -> String {
+        let samples = self.settings.train.as_ref().map_or(0, |t| t.samples);
+        format!("{} rays of {samples} samples", self.rays)
+    }
+    fn write_data(&self, folder: &RunFolder) -> Result<(), Error> {
+        results::write_data(folder, &self.data)
+    }
+    fn write_frame(&mut self, folder: &RunFolder) -> Result<(), Error> {
+        results::write_frame(folder, self)
+    }
+    fn finish(
+        &mut self,
+        folder: &RunFolder,
+        layered: &Layered,
+        metrics: &mut Metrics,
+        seconds: &dyn Fn() -> f64,
+    ) -> Result<(), Error> {
+        let entry = self.measure()?;
+        metrics.last = Some(Final { entry, seconds: seconds(), warps: vec![] });
+        self.scores = Some(results::write_results(folder, layered, self, metrics)?);
+        Ok(())
+    }
+    fn summary(&self, last: &Final) -> String {
+        let (steps, time) = (last.entry.step, crate::report::duration(last.seconds));
+        let mut text = String::new();
+        if let Measured::Space { rotation_error_deg: Some(r), translation_error_x100: Some(t), .. } =
+            last.entry.measured
+        {
+            text += &format!("rotation error     {r:.3} deg (mean over {} training views)\n", self.data.rough.len());
+            text += &format!("translation error  {t:.3} x 0.01\n");
+        }
+        if let Some(s) = &self.scores {
+            let refined =
+                |v: Option<f64>, places: usize| v.map_or(String::new(), |v| format!(", refined {v:.places$}"));
+            let (psnr, ssim) = (refined(s.refined_psnr_db, 2), refined(s.refined_ssim, 3));
+            text += &format!("test PSNR          {:.2} dB{psnr} ({} views)\n", s.psnr_db, s.views.len());
+            text += &format!("test SSIM          {:.3}{ssim}\n", s.ssim);
+        }
+        text + &format!("training PSNR      {:.2} dB\nsteps              {steps} in {time}\n", last.entry.psnr_db())
+    }
+}
