@@ -1,4 +1,4 @@
-//! Volume rendering at a small size: rays from a warp network, points along them, a field with a skip layer and a view
+//! Volume rendering at a small size: rays from a warp network or given ones, points along them, a field with a skip layer and a view
 //! branch, compositing, a loss of colour, depth and opacity, and its gradients.
 
 use crate::{Rng, seed, total};
@@ -19,6 +19,8 @@ pub struct Sizes {
     pub samples: usize,
     pub width: usize,
     pub hidden: Activation,
+    /// Rays from a warp network, or given up to a shift a frame: cheap to compute wherever they are needed.
+    pub warped: bool,
 }
 
 pub struct Rendering {
@@ -41,7 +43,11 @@ impl Rendering {
         let per_ray = |name: &str, channels: usize| Tensor::data(name, Shape::new(&[&frame, &ray], channels));
         let code = Tensor::parameter("code", Shape::new(&[&frame], CODE));
         let warp = Mlp::new(MlpSpec::new("warp", &[2 + CODE, 12, 6]).hidden(Activation::Tanh));
-        let moved = warp.apply(&concat([&per_ray("pixel", 2), &code]));
+        let moved = if sizes.warped {
+            warp.apply(&concat([&per_ray("pixel", 2), &code]))
+        } else {
+            per_ray("rays", 6) + code.pick(&[0, 1, 2, 3, 0, 1])
+        };
         let origin = moved.slice(0..3) * 0.3;
         let direction = moved.slice(3..6) * 0.3 + Tensor::constant(&[0.1, -0.2, 1.0]);
         let length = (&direction * &direction).sum_channels().sqrt();
@@ -70,7 +76,8 @@ impl Rendering {
         let error = &rgb + (1.0 - &opacity) * 0.7 - per_ray("target", 3);
         let off = &far - per_ray("range", 1);
         let loss = (&error * &error).mean_all() + (&off * &off).mean_all() * 0.1;
-        let parameters = [&trunk, &colours, &warp].into_iter().flat_map(|m| &m.parameters).map(|p| p.tensor.clone());
+        let networks = [&trunk, &colours, &warp].into_iter().take(if sizes.warped { 3 } else { 2 });
+        let parameters = networks.flat_map(|m| &m.parameters).map(|p| p.tensor.clone());
         let parameters: Vec<Tensor> = parameters.chain([code]).collect();
         let bindings = bindings(&loss);
         Rendering { rgb, depth: far, opacity, loss, parameters, bindings }
@@ -117,7 +124,7 @@ fn bindings(loss: &Tensor) -> Bindings {
     for input in topological([loss.clone()]).iter().filter_map(|t| t.op_as::<Input>()) {
         let (low, high) = match &*input.name {
             "noise" | "target" | "range" => (0.1, 0.9),
-            "pixel" | "code" => (-1.0, 1.0),
+            "pixel" | "rays" | "code" => (-1.0, 1.0),
             _ => (-0.5, 0.5),
         };
         all.insert(input.name.clone(), rng.array(&input.shape, low, high));

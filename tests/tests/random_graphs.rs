@@ -3,7 +3,8 @@
 //! `RAYGRAD_NIGHTLY=1` runs 10 000 of them, `RAYGRAD_GRAPHS=first..end` those of some seeds. A failure prints the smallest
 //! recipe found that still fails.
 
-use raygrad_compiler::StepError;
+use raygrad_compiler::plan::region::RegionOp;
+use raygrad_compiler::{Program, StepError, Target, compile};
 use raygrad_runtime::Device;
 use raygrad_tests::backend::devices_for_large_programs;
 use raygrad_tests::check::{check, same_bits};
@@ -69,6 +70,19 @@ fn check_graphs(part: u64, parts: u64) {
     }
     let _ = std::panic::take_hook();
     assert!(failures.is_empty(), "{} graphs fail\n{}", failures.len(), failures.join("\n\n"));
+}
+
+/// What a test of fusion needs to meet must occur.
+#[test]
+fn reductions_inside_tiles_occur_often() {
+    let holds = |seed: &u64| {
+        let step = Recipe::new(*seed).build().step;
+        let program = compile(&step, &Target::cpu());
+        let insts = |p: &Program| p.launches.iter().flat_map(|l| l.region.body.clone()).collect::<Vec<_>>();
+        program.is_ok_and(|p| insts(&p).iter().any(|i| matches!(i.op, RegionOp::RowReduce(_))))
+    };
+    let found = (0..100).filter(holds).count();
+    assert!(found >= 25, "{found} of 100 graphs");
 }
 
 #[test]

@@ -13,7 +13,7 @@ use raygrad_tests::rendering::{Rendering, Sizes};
 use raygrad_tests::{Rng, seed};
 use std::collections::BTreeMap;
 
-const SMALL: Sizes = Sizes { frames: 2, rays: 3, samples: 8, width: 17, hidden: Activation::Relu };
+const SMALL: Sizes = Sizes { frames: 2, rays: 3, samples: 8, width: 17, hidden: Activation::Relu, warped: true };
 
 fn checked(step: &Step, bindings: &Bindings) {
     step.check().unwrap_or_else(|e| panic!("{e}"));
@@ -34,7 +34,9 @@ fn reducing(program: &Program) -> usize {
 
 #[test]
 fn values_and_gradients() {
-    for sizes in [SMALL, Sizes { frames: 3, rays: 5, samples: 16, ..SMALL }, Sizes { rays: 1, samples: 130, ..SMALL }] {
+    let more = Sizes { frames: 3, rays: 5, samples: 16, ..SMALL };
+    let long = Sizes { rays: 1, samples: 130, warped: false, ..SMALL };
+    for sizes in [SMALL, more, long, Sizes { warped: false, ..SMALL }] {
         let scene = Rendering::new(sizes);
         checked(&scene.step(), &scene.bindings);
     }
@@ -42,15 +44,19 @@ fn values_and_gradients() {
 
 #[test]
 fn second_derivatives() {
-    let scene = Rendering::new(Sizes { width: 9, hidden: Activation::Tanh, ..SMALL });
-    let (step, bindings) = scene.second_order();
-    checked(&step, &bindings);
+    for warped in [true, false] {
+        let scene = Rendering::new(Sizes { width: 9, hidden: Activation::Tanh, warped, ..SMALL });
+        let (step, bindings) = scene.second_order();
+        checked(&step, &bindings);
+    }
 }
 
 /// Every layer of the field is computed once forwards and once backwards, all of them in one launch.
 #[test]
 fn one_pass_over_the_samples() {
-    for sizes in [SMALL, Sizes { frames: 4, rays: 64, samples: 128, width: 257, ..SMALL }] {
+    let large = Sizes { frames: 4, rays: 64, samples: 128, width: 257, ..SMALL };
+    // Given rays: the first layers need nothing from memory, the view branch does.
+    for sizes in [SMALL, large, Sizes { warped: false, ..SMALL }, Sizes { warped: false, ..large }] {
         let program = plan(&Rendering::new(sizes).step(), Target::cpu());
         let field = |b: usize| match &program.buffers[b].kind {
             BufferKind::Input { name, .. } => name.starts_with("field") || name.starts_with("view"),

@@ -52,6 +52,10 @@ impl Info {
     pub fn key(&self) -> Key {
         Key { depth: self.depth, domain: self.domain.clone(), inner: self.inner.clone(), grain: self.grain }
     }
+    /// Whether it is computed element by element along the last axis of `domain`.
+    pub fn runs_along(&self, domain: &Axes) -> bool {
+        self.domain == *domain && self.inner.as_ref() == domain.last()
+    }
     /// Order of instructions: a copy comes just before its original.
     pub fn rank(&self) -> (u64, bool) {
         (self.copy_of.as_ref().unwrap_or(&self.tensor).id(), self.copy_of.is_none())
@@ -89,16 +93,20 @@ pub(super) struct Cuts {
     pub order: Vec<u64>,
     pub target: Target,
     copies: Copies,
+    /// Depth before which no region over a domain of whole lines starts.
+    starts: HashMap<Axes, usize>,
 }
 
 impl Cuts {
     pub fn new(roots: &[Tensor], target: Target) -> Cuts {
-        let mut cuts = Cuts { nodes: HashMap::new(), order: vec![], target, copies: Copies::default() };
+        let (copies, starts) = (Copies::default(), HashMap::new());
+        let mut cuts = Cuts { nodes: HashMap::new(), order: vec![], target, copies, starts };
         cuts.inspect_all(roots);
-        cuts.copies = lines::find(&cuts);
-        if !cuts.copies.is_empty() {
+        let domains = lines::domains(&cuts);
+        cuts.copies = lines::copies(&cuts, &domains);
+        if !domains.is_empty() {
             cuts.inspect_all(roots);
-            cuts.keep_needed(roots);
+            domains.iter().for_each(|d| cuts.start_late(roots, d));
         }
         cuts.sink(roots);
         cuts
@@ -121,6 +129,9 @@ impl Cuts {
             self.order.push(t.id());
             self.nodes.insert(t.id(), info);
         }
+        if !self.copies.is_empty() {
+            self.keep_needed(roots);
+        }
     }
 
     /// Drops nodes that only others' copies were for.
@@ -133,6 +144,28 @@ impl Cuts {
             }
         }
         self.order.retain(|id| needed.contains(id));
+    }
+
+    /// Starts the first region over `domain` as late as it can without making the last one later: what one layer needs
+    /// from memory then does not part it from the layers before it, which need nothing.
+    fn start_late(&mut self, roots: &[Tensor], domain: &Axes) {
+        let Some((first, last)) = self.span(domain) else { return };
+        for depth in (first + 1..=last).rev() {
+            self.starts.insert(domain.clone(), depth);
+            self.inspect_all(roots);
+            if self.span(domain).is_some_and(|s| s.1 == last) {
+                return;
+            }
+        }
+        if self.starts.remove(domain).is_some() {
+            self.inspect_all(roots);
+        }
+    }
+
+    /// Least and greatest depth of what is computed over `domain`.
+    fn span(&self, domain: &Axes) -> Option<(usize, usize)> {
+        let here = self.order.iter().map(|id| &self.nodes[id]).filter(|i| i.runs_along(domain) && !i.free);
+        here.map(|i| (i.depth, i.depth)).reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
     }
 
     pub fn get(&self, t: &Tensor) -> &Info {
@@ -170,7 +203,8 @@ impl Cuts {
             depth: 0,
             closure_flops: 0,
         };
-        for i in (0..info.operands.len()).filter(|_| info.inner.as_ref() == info.domain.last()) {
+        let along = info.runs_along(&info.domain);
+        for i in (0..info.operands.len()).filter(|_| along) {
             let copy = self.copies.within(info.operands[i].id(), &info.domain);
             if let Some(copy) = copy.filter(|_| !info.needs_buffer(i)) {
                 info.operands[i] = copy.clone();
@@ -210,6 +244,9 @@ impl Cuts {
             })
             .max()
             .unwrap_or(0);
+        if along {
+            info.depth = info.depth.max(self.starts.get(&info.domain).copied().unwrap_or(0));
+        }
         if info.free {
             info.depth = 0;
         }

@@ -35,17 +35,25 @@ impl Copies {
     }
 }
 
-/// All copies worth making.
-pub(super) fn find(cuts: &Cuts) -> Copies {
+/// Domains with layers whose lines fit into tiles and are reduced.
+pub(super) fn domains(cuts: &Cuts) -> Vec<Axes> {
+    let all = || cuts.order.iter().map(|id| &cuts.nodes[id]);
     let mut domains: Vec<Axes> = vec![];
-    for info in cuts.order.iter().map(|id| &cuts.nodes[id]) {
-        if is_line(cuts, info) && !domains.contains(&info.domain) {
+    for info in all().filter(|i| is_line(cuts, i)) {
+        let expensive =
+            |i: &Info| i.runs_along(&info.domain) && (matches!(i.form, Form::Linear { .. }) || cuts.is_costly(i));
+        if !domains.contains(&info.domain) && all().any(expensive) {
             domains.push(info.domain.clone());
         }
     }
+    domains
+}
+
+/// The copies that regions over `domains` compute.
+pub(super) fn copies(cuts: &Cuts, domains: &[Axes]) -> Copies {
     let mut copies = Copies::default();
     for domain in domains {
-        for id in between(cuts, &domain) {
+        for id in between(cuts, domain) {
             let t = &cuts.nodes[&id].tensor;
             let copy = with_source(t.source(), || Tensor::record_arc(t.op().clone(), t.inputs().to_vec()));
             copies.0.entry(id).or_default().push((domain.clone(), copy));
@@ -65,21 +73,16 @@ fn is_line(cuts: &Cuts, info: &Info) -> bool {
     *info.tensor.axes() == outer && inner.size() <= most
 }
 
-/// The nodes between a reduction along the inner axis of `domain` that follows something expensive, and elements of the
-/// domain that use it: the reductions themselves and what is pointwise after them, in order.
+/// The nodes between a reduction along the inner axis of `domain` and elements of the domain that use it: the reductions
+/// themselves and what is pointwise after them, in order.
 fn between(cuts: &Cuts, domain: &Axes) -> Vec<u64> {
     let outer = Axes::new(domain.iter().take(domain.len().saturating_sub(1)).cloned());
-    let here = |i: &Info| i.domain == *domain && i.inner.as_ref() == domain.last();
-    let (mut expensive, mut reached) = (HashSet::new(), HashSet::new());
+    let mut reached = HashSet::new();
     for id in &cuts.order {
         let info = &cuts.nodes[id];
-        let after = |set: &HashSet<u64>| info.operands.iter().any(|o| set.contains(&o.id()));
-        if after(&expensive) || here(info) && (matches!(info.form, Form::Linear { .. }) || cuts.is_costly(info)) {
-            expensive.insert(*id);
-        }
-        let line = here(info) && is_line(cuts, info) && expensive.contains(id);
         let cheap = matches!(info.form, Form::Pointwise(_) | Form::Pick(_) | Form::ChannelSum(_) | Form::ChannelMax);
-        if line || cheap && info.domain == outer && after(&reached) {
+        let follows = cheap && info.domain == outer && info.operands.iter().any(|o| reached.contains(&o.id()));
+        if follows || info.domain == *domain && is_line(cuts, info) {
             reached.insert(*id);
         }
     }
@@ -90,7 +93,7 @@ fn between(cuts: &Cuts, domain: &Axes) -> Vec<u64> {
         if copied {
             all.push(*id);
         }
-        if copied || here(info) {
+        if copied || info.runs_along(domain) {
             let values = (0..info.operands.len()).filter(|i| !info.needs_buffer(*i));
             used.extend(values.map(|i| info.operands[i].id()));
         }
