@@ -86,7 +86,8 @@ fn matrix_kernels(isa: Isa, k: usize, n: usize, rows: usize, seconds: f64) {
     let mut g = AlignedVec::zeroed(outer_len(k, n) * SETS);
     report(&format!("{isa} outer {k}x{n}, {rows} rows"), flops, seconds, |i| {
         let g = g[i % SETS * outer_len(k, n)..].as_mut_ptr();
-        let args = Outer { x: x.as_ptr(), ldx: ld, k, d: y.as_ptr(), ldd: ld, n, rows, g };
+        let d = y.as_ptr();
+        let args = Outer { x: x.as_ptr(), ldx: ld, k, first: 0, channels: k, d, ldd: ld, n, rows, g };
         // SAFETY: as above.
         unsafe { outer(isa, args) }
     });

@@ -151,42 +151,56 @@ fn fused_gemm_is_bitwise_equal_across_instruction_sets() {
     }
 }
 
-/// Runs `outer` twice on the same accumulator, then unblocks it.
-fn outer_twice(isa: Isa, k: usize, n: usize, rows: usize) -> (AlignedVec, Vec<f32>) {
+/// Runs `outer` twice on the same accumulator, the second time with `x` in two parts, and adds the result to ones.
+fn outer_twice(isa: Isa, k: usize, n: usize, rows: usize) -> Vec<f32> {
     let ld = row_stride(rows);
     let (x, d) = (noise(k * ld, 5), noise(n * ld, 6));
-    let mut g = AlignedVec::zeroed(outer_len(k, n));
-    let args = Outer { x: x.as_ptr(), ldx: ld, k, d: d.as_ptr(), ldd: ld, n, rows, g: g.as_mut_ptr() };
-    // SAFETY: `isa` is available, and the buffers have the shapes given.
-    unsafe {
-        outer(isa, args);
-        outer(isa, args);
+    let mut g = AlignedVec::zeroed(outer_len(k, n) + 1);
+    g[outer_len(k, n)] = CANARY;
+    let split = if outer::x_along_vectors(k, n) { k / 2 / outer::PANEL * outer::PANEL } else { k / 2 };
+    for (first, end) in [(0, k), (0, split), (split, k)] {
+        let args = Outer {
+            x: x[first * ld..].as_ptr(),
+            ldx: ld,
+            k: end - first,
+            first,
+            channels: k,
+            d: d.as_ptr(),
+            ldd: ld,
+            n,
+            rows,
+            g: g.as_mut_ptr(),
+        };
+        // SAFETY: `isa` is available, and the buffers have the shapes given.
+        unsafe { outer(isa, args) };
     }
+    assert_eq!(g[outer_len(k, n)], CANARY, "stray write");
     let mut out = vec![1.0; k * n];
     unblock(&g, k, n, &mut out, true);
-    (g, out)
+    out
 }
 
 #[test]
-fn outer_matches_f64_and_leaves_padding_zero() {
-    for isa in Isa::available() {
-        for (i, k) in SIZES.into_iter().enumerate() {
-            for (j, n) in partners(k).enumerate() {
-                let rows = [16, 32, 96, 192][(i + j) % 4];
-                let ld = row_stride(rows);
-                let (x, d) = (noise(k * ld, 5), noise(n * ld, 6));
-                let (g, out) = outer_twice(isa, k, n, rows);
+fn outer_matches_f64_and_agrees_where_multiply_adds_are_fused() {
+    for (i, k) in SIZES.into_iter().enumerate() {
+        for (j, n) in partners(k).enumerate() {
+            let rows = [4, 32, 96, 192, 404][(i + j) % 5];
+            let ld = row_stride(rows);
+            let (x, d) = (noise(k * ld, 5), noise(n * ld, 6));
+            let mut fused: Option<Vec<f32>> = None;
+            for isa in Isa::available() {
+                let out = outer_twice(isa, k, n, rows);
                 for a in 0..k {
                     for b in 0..n {
                         let pairs = x[a * ld..].iter().zip(&d[b * ld..]).take(rows);
                         let expected = 1.0 + 2.0 * pairs.map(|(&x, &d)| x as f64 * d as f64).sum::<f64>();
                         let got = out[a * n + b] as f64;
-                        assert!((got - expected).abs() < 2e-5, "{isa} {k}x{n}: g[{a}][{b}] = {got}, not {expected}");
+                        assert!((got - expected).abs() < 5e-5, "{isa} {k}x{n}: g[{a}][{b}] = {got}, not {expected}");
                     }
                 }
-                let (total, inside): (f64, f64) =
-                    (g.iter().map(|v| v.abs() as f64).sum(), out.iter().map(|v| (v - 1.0).abs() as f64).sum());
-                assert!((total - inside).abs() < 1e-5 * (total + 1.0), "{isa} {k}x{n}: padding is not zero");
+                if isa != Isa::Portable {
+                    assert_eq!(*fused.get_or_insert(out.clone()), out, "{isa} {k}x{n} differs");
+                }
             }
         }
     }
@@ -209,18 +223,20 @@ impl PartialEq for AlignedVec {
 
 #[test]
 fn unblock_replaces_or_adds() {
-    let (k, n) = (5, 6);
-    let mut g = vec![0.0; outer_len(k, n)];
-    for i in 0..k {
-        for j in 0..n {
-            g[((i / 4 * 2 + j / 4) * 4 + i % 4) * 4 + j % 4] = (i * n + j) as f32;
+    for (k, n) in [(5, 6), (70, 3), (3, 70)] {
+        let mut g = vec![f32::NAN; outer_len(k, n)];
+        for i in 0..k {
+            for j in 0..n {
+                let (vector, other, others) = if outer::x_along_vectors(k, n) { (i, j, n) } else { (j, i, k) };
+                g[(vector / 32 * others + other) * 32 + vector % 32] = (i * n + j) as f32;
+            }
         }
+        let mut out = vec![9.0; k * n];
+        unblock(&g, k, n, &mut out, false);
+        assert!(out.iter().enumerate().all(|(i, &v)| v == i as f32));
+        unblock(&g, k, n, &mut out, true);
+        assert!(out.iter().enumerate().all(|(i, &v)| v == 2.0 * i as f32));
     }
-    let mut out = vec![9.0; k * n];
-    unblock(&g, k, n, &mut out, false);
-    assert!(out.iter().enumerate().all(|(i, &v)| v == i as f32));
-    unblock(&g, k, n, &mut out, true);
-    assert!(out.iter().enumerate().all(|(i, &v)| v == 2.0 * i as f32));
 }
 
 #[test]

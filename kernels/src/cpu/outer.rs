@@ -1,154 +1,278 @@
 //! Sum of outer products of two channel-major tiles, `g[k][n] += sum_r x[k][r] d[n][r]`: the gradient of weights.
 //!
-//! The sum over rows runs inside vectors, so a 4x4 block of `g` takes 16 accumulator vectors, which a transposing tree
-//! reduces to the 16 sums at the end. `g` therefore lives in **blocks**, `[k / 4][n / 4][4][4]`: one cache line each.
-//! Accumulators start at zero and are added to `g` last, because `g` often has to come from far away.
+//! One operand is transposed, [`PANEL`] channels at a time, so that its channels lie along vectors. The rest is the
+//! micro-kernel of [`super::gemm()`]: `MR` channels of the other operand, each broadcast, times `NV` vectors, summed over
+//! rows in registers. Sums start at zero and are added to `g` last, because `g` often has to come from far away.
+//!
+//! `g` lies in panels too, `[vectors / 32][others][32]`. The operand along vectors is the one that costs less
+//! ([`x_along_vectors`]); every sum over rows runs in order, with fused multiply-adds where there are any.
 use super::Isa;
 use super::simd::{Kernel, Simd, launch};
+use std::mem::MaybeUninit;
 
-/// Side of a block of the accumulator.
-pub const BLOCK: usize = 4;
-/// Floats of a block.
-const BLOCK_LEN: usize = BLOCK * BLOCK;
-/// Floats of `d` that stay in the L1 cache while all strips of `x` pass by: half of a small cache.
-const RESIDENT: usize = 4096;
+/// Channels of a panel.
+pub const PANEL: usize = 32;
+/// Row counts are multiples of this.
+pub const ROWS: usize = 4;
+/// Most rows of a transposed panel: 24 KiB, which stay in the L1 cache while the other operand passes by.
+const PANEL_ROWS: usize = 192;
+/// Transposing a value takes about as long as this many multiply-adds.
+const TRANSPOSITION: usize = 6;
 
 /// Operands of [`outer`].
 #[derive(Clone, Copy, Debug)]
 pub struct Outer {
-    /// `[k][rows]`, row stride `ldx`.
+    /// `[k][rows]`, row stride `ldx`: the channels from `first` on of an operand that has `channels` of them.
     pub x: *const f32,
     pub ldx: usize,
     pub k: usize,
+    /// A multiple of [`PANEL`] if `x` lies along vectors, and then `k` is one too, except for the last channels.
+    pub first: usize,
+    pub channels: usize,
     /// `[n][rows]`, row stride `ldd`.
     pub d: *const f32,
     pub ldd: usize,
     pub n: usize,
-    /// A multiple of 16; all of them count.
+    /// A multiple of [`ROWS`]; all of them count.
     pub rows: usize,
-    /// Blocked accumulator of [`outer_len`] floats.
+    /// Accumulator of [`outer_len`]`(channels, n)` floats, in panels.
     pub g: *mut f32,
 }
 
-/// Floats of a blocked `k` by `n` accumulator.
-pub fn outer_len(k: usize, n: usize) -> usize {
-    k.div_ceil(BLOCK) * n.div_ceil(BLOCK) * BLOCK_LEN
+/// Whether the rows of a `k` by `n` accumulator, and so the channels of `x`, lie along vectors. Otherwise those of `d` do.
+pub fn x_along_vectors(k: usize, n: usize) -> bool {
+    let cost = |vectors: usize, others: usize| vectors.next_multiple_of(16) * (others + TRANSPOSITION);
+    cost(k, n) < cost(n, k)
 }
 
-/// Adds the outer products of all rows to `g`; the padding of edge blocks is left alone.
+/// Floats of a `k` by `n` accumulator in panels.
+pub fn outer_len(k: usize, n: usize) -> usize {
+    if x_along_vectors(k, n) { k.next_multiple_of(PANEL) * n } else { k * n.next_multiple_of(PANEL) }
+}
+
+/// Adds the outer products of all rows to `g`. What the padding of its last panel holds afterwards means nothing.
 ///
 /// # Safety
-/// `isa.supported()`. `rows` is a multiple of 16; the pointers are valid for the shapes given at the fields; `g`
+/// `isa.supported()`. `rows` is a multiple of [`ROWS`]; the pointers are valid for the shapes given at the fields; `g`
 /// overlaps neither `x` nor `d`.
 pub unsafe fn outer(isa: Isa, args: Outer) {
-    debug_assert_eq!(args.rows % 16, 0);
+    debug_assert!(args.rows.is_multiple_of(ROWS));
+    debug_assert!(args.first + args.k <= args.channels);
+    debug_assert!(args.first.is_multiple_of(PANEL) || !x_along_vectors(args.channels, args.n));
     // SAFETY: forwarded contract.
     unsafe { launch(isa, &args) }
 }
 
-/// Copies (or adds) a blocked accumulator to the row-major `[k][n]` matrix `out`.
+/// Copies (or adds) an accumulator in panels to the row-major `[k][n]` matrix `out`.
 ///
 /// # Panics
 /// If `g` (of [`outer_len`] floats) or `out` is too short.
 pub fn unblock(g: &[f32], k: usize, n: usize, out: &mut [f32], add: bool) {
     let g = &g[..outer_len(k, n)];
-    let row_len = n.div_ceil(BLOCK) * BLOCK_LEN;
+    let x_along_vectors = x_along_vectors(k, n);
     for (i, row) in out[..k * n].chunks_exact_mut(n.max(1)).enumerate() {
-        let blocks = g[i / BLOCK * row_len..][..row_len].chunks_exact(BLOCK_LEN);
-        for (out, block) in row.chunks_mut(BLOCK).zip(blocks) {
-            let block = &block[i % BLOCK * BLOCK..][..BLOCK];
-            for (out, &value) in out.iter_mut().zip(block) {
+        for (p, out) in row.chunks_mut(PANEL).enumerate() {
+            let (from, step) = if x_along_vectors {
+                (&g[(i / PANEL * n + p * PANEL) * PANEL + i % PANEL..], PANEL)
+            } else {
+                (&g[(p * k + i) * PANEL..], 1)
+            };
+            for (out, &value) in out.iter_mut().zip(from.iter().step_by(step)) {
                 *out = if add { *out + value } else { value };
             }
         }
     }
 }
 
+/// Some channels of a tile, `ld` floats apart.
+#[derive(Clone, Copy)]
+struct Channels {
+    at: *const f32,
+    ld: usize,
+    count: usize,
+}
+
+/// A transposed panel, `[row][PANEL]`.
+#[repr(align(64))]
+struct Panel(MaybeUninit<[f32; PANEL_ROWS * PANEL]>);
+
 impl Kernel for Outer {
     type Out = ();
 
     #[inline(always)]
     unsafe fn run<S: Simd>(&self) {
-        // SAFETY: forwarded contract.
+        // SAFETY: forwarded contract. `NV * LANES` divides `PANEL`.
         unsafe {
             match S::REGISTERS {
-                32.. => self.blocks::<S, 4>(),
-                16.. => self.blocks::<S, 2>(),
-                _ => self.blocks::<S, 1>(),
+                32.. => self.panels::<S, 8, 2, 1>(),
+                16.. => self.panels::<S, 3, 4, 2>(),
+                _ => self.panels::<S, 2, 2, 1>(),
             }
         }
     }
 }
 
 impl Outer {
-    /// All blocks, `N` columns of a block at a time.
+    /// All panels, in blocks of `MR` channels and `NV` vectors, or `HALF` as many at the end of the last panel.
     ///
     /// # Safety
-    /// As [`outer`], and `N` divides [`BLOCK`].
+    /// As [`outer`], and `NV * S::LANES` divides [`PANEL`].
     #[inline(always)]
-    unsafe fn blocks<S: Simd, const N: usize>(&self) {
-        let (row_blocks, column_blocks) = (self.k.div_ceil(BLOCK), self.n.div_ceil(BLOCK));
-        let group = (RESIDENT / (BLOCK * self.rows.max(1))).max(2);
-        let mut first = 0;
-        while first < column_blocks {
-            let last = column_blocks.min(first + group);
-            for kb in 0..row_blocks {
-                for nb in first..last {
-                    // SAFETY: block (kb, nb) lies inside `g`. An edge block goes to a zeroed copy first.
-                    unsafe {
-                        let g = self.g.add((kb * column_blocks + nb) * BLOCK_LEN);
-                        if (kb + 1) * BLOCK <= self.k && (nb + 1) * BLOCK <= self.n {
-                            self.block::<S, N>(kb, nb, g);
+    unsafe fn panels<S: Simd, const MR: usize, const NV: usize, const HALF: usize>(&self) {
+        let x = Channels { at: self.x, ld: self.ldx, count: self.k };
+        let d = Channels { at: self.d, ld: self.ldd, count: self.n };
+        let (vectors, others, height, first) = if x_along_vectors(self.channels, self.n) {
+            (x, d, self.n, self.first * self.n)
+        } else {
+            (d, x, self.channels, self.first * PANEL)
+        };
+        let mut panel = Panel(MaybeUninit::uninit());
+        let panel: *mut f32 = panel.0.as_mut_ptr().cast();
+        let mut row = 0;
+        while row < self.rows {
+            let rows = PANEL_ROWS.min(self.rows - row);
+            let mut channel = 0;
+            while channel < vectors.count {
+                let count = PANEL.min(vectors.count - channel);
+                // SAFETY: `count` channels from `channel` on and `rows` rows from `row` on lie inside the operand, and
+                // the panel has room for them. Panel `channel / PANEL` of `g` has `height` lines of `PANEL` floats.
+                unsafe {
+                    let from = Channels { at: vectors.at.add(channel * vectors.ld + row), count, ..vectors };
+                    transpose::<S>(from, rows, panel);
+                    let others = Channels { at: others.at.add(row), ..others };
+                    let g = self.g.add(first + channel * height);
+                    let mut column = 0;
+                    while column < count {
+                        let (panel, g) = (panel.add(column), g.add(column));
+                        if count - column > HALF * S::LANES {
+                            blocks::<S, MR, NV>(panel, others, rows, g);
                         } else {
-                            let mut sums = [0.0; BLOCK_LEN];
-                            self.block::<S, N>(kb, nb, sums.as_mut_ptr());
-                            for i in 0..BLOCK.min(self.k - kb * BLOCK) {
-                                for j in 0..BLOCK.min(self.n - nb * BLOCK) {
-                                    *g.add(i * BLOCK + j) += sums[i * BLOCK + j];
-                                }
-                            }
+                            blocks::<S, MR, HALF>(panel, others, rows, g);
                         }
+                        column += NV * S::LANES;
                     }
                 }
+                channel += PANEL;
             }
-            first = last;
+            row += rows;
         }
     }
+}
 
-    /// Adds block (kb, nb) of the result to the block at `g`. Channels beyond the last one read the last one.
-    ///
-    /// # Safety
-    /// As [`outer`]; `kb` and `nb` are block indices in range, and `g` is valid for a block.
-    #[inline(always)]
-    unsafe fn block<S: Simd, const N: usize>(&self, kb: usize, nb: usize, g: *mut f32) {
-        // SAFETY: channel indices are clamped to `k - 1` and `n - 1`, rows stay below `rows`, which `LANES` divides.
+/// Writes `rows` rows of up to [`PANEL`] channels to `panel`, in whole vectors; channels beyond the last one repeat it.
+///
+/// # Safety
+/// As [`outer`]: the channels have `rows` rows, and `panel` has room for as many lines of [`PANEL`] floats.
+#[inline(always)]
+unsafe fn transpose<S: Simd>(from: Channels, rows: usize, panel: *mut f32) {
+    let mut channel = 0;
+    while channel < from.count {
+        let mut at = [from.at; 16];
+        for (i, at) in at.iter_mut().enumerate() {
+            *at = from.at.wrapping_add((channel + i).min(from.count - 1) * from.ld);
+        }
+        let mut row = 0;
+        while row < rows {
+            // SAFETY: four rows of existing channels, and four lines of the panel; `LANES` divides `PANEL`.
+            unsafe { S::transpose_rows(&at, row, panel.add(row * PANEL + channel), PANEL) };
+            row += ROWS;
+        }
+        channel += S::LANES;
+    }
+}
+
+/// All blocks of `NV` vectors: `MR` channels of `others` each, or a little fewer if that divides them evenly.
+///
+/// # Safety
+/// As [`Outer::panels`]: `panel` and `g` point to the first of `NV` vectors, `g` has a line for each of `others`.
+#[inline(always)]
+unsafe fn blocks<S: Simd, const MR: usize, const NV: usize>(
+    panel: *const f32,
+    others: Channels,
+    rows: usize,
+    g: *mut f32,
+) {
+    let mut channel = 0;
+    while channel < others.count {
+        let rest = others.count - channel;
+        let count = rest.div_ceil(rest.div_ceil(MR));
+        // SAFETY: `count <= rest` channels and lines are left.
         unsafe {
-            S::prefetch(g);
-            let mut xs = [self.x; BLOCK];
-            for i in 0..BLOCK {
-                xs[i] = self.x.add((kb * BLOCK + i).min(self.k - 1) * self.ldx);
+            let (from, g) = (Channels { at: others.at.add(channel * others.ld), ..others }, g.add(channel * PANEL));
+            match count {
+                1 => block::<S, 1, NV>(panel, from, rows, g),
+                2 => block::<S, 2, NV>(panel, from, rows, g),
+                3 => block::<S, 3, NV>(panel, from, rows, g),
+                // Guarded, so that narrow kernels do not compile blocks that they never need.
+                4 if MR > 4 => block::<S, 4, NV>(panel, from, rows, g),
+                5 if MR > 4 => block::<S, 5, NV>(panel, from, rows, g),
+                6 if MR > 4 => block::<S, 6, NV>(panel, from, rows, g),
+                7 if MR > 4 => block::<S, 7, NV>(panel, from, rows, g),
+                _ => block::<S, MR, NV>(panel, from, rows, g),
             }
-            for part in 0..BLOCK / N {
-                let mut ds = [self.d; N];
-                for j in 0..N {
-                    ds[j] = self.d.add((nb * BLOCK + part * N + j).min(self.n - 1) * self.ldd);
-                }
-                let mut acc = [[S::splat(0.0); N]; BLOCK];
-                let mut row = 0;
-                while row < self.rows {
-                    let mut dv = [S::splat(0.0); N];
-                    for j in 0..N {
-                        dv[j] = S::load(ds[j].add(row));
+        }
+        channel += count;
+    }
+}
+
+/// Adds one block to `g`: the first `MR` channels of `others` by `NV` vectors of the panel.
+///
+/// # Safety
+/// As [`blocks`], and `others` has `MR` channels left.
+#[inline(always)]
+unsafe fn block<S: Simd, const MR: usize, const NV: usize>(
+    panel: *const f32,
+    others: Channels,
+    rows: usize,
+    g: *mut f32,
+) {
+    // SAFETY: rows stay below `rows`, a multiple of `ROWS`; vectors and lines are those that the caller vouches for.
+    unsafe {
+        for i in 0..MR {
+            for j in 0..NV {
+                S::prefetch(g.add(i * PANEL + j * S::LANES));
+            }
+        }
+        let zero = S::splat(0.0);
+        let mut acc = [[zero; NV]; MR];
+        let mut xs = [others.at; MR];
+        for i in 0..MR {
+            xs[i] = others.at.add(i * others.ld);
+        }
+        let mut row = 0;
+        while row < rows {
+            for r in row..row + ROWS {
+                let line = panel.add(r * PANEL);
+                if NV > MR {
+                    let mut ws = [zero; MR];
+                    for i in 0..MR {
+                        ws[i] = S::splat(*xs[i].add(r));
                     }
-                    for i in 0..BLOCK {
-                        let xv = S::load(xs[i].add(row));
-                        for j in 0..N {
-                            acc[i][j] = S::fma(xv, dv[j], acc[i][j]);
+                    for j in 0..NV {
+                        let v = S::load(line.add(j * S::LANES));
+                        for i in 0..MR {
+                            acc[i][j] = S::fma(ws[i], v, acc[i][j]);
                         }
                     }
-                    row += S::LANES;
+                } else {
+                    let mut vs = [zero; NV];
+                    for j in 0..NV {
+                        vs[j] = S::load(line.add(j * S::LANES));
+                    }
+                    for i in 0..MR {
+                        let w = S::splat(*xs[i].add(r));
+                        for j in 0..NV {
+                            acc[i][j] = S::fma(w, vs[j], acc[i][j]);
+                        }
+                    }
                 }
-                S::add_lane_sums::<N>(&acc, g.add(part * N));
+            }
+            row += ROWS;
+        }
+        for i in 0..MR {
+            for j in 0..NV {
+                let g = g.add(i * PANEL + j * S::LANES);
+                S::store(g, S::add(S::load(g), acc[i][j]));
             }
         }
     }

@@ -60,8 +60,8 @@ pub(super) trait Simd {
     unsafe fn ueq(a: Self::V, b: Self::V) -> Self::M;
     unsafe fn select(m: Self::M, a: Self::V, b: Self::V) -> Self::V;
 
-    /// Adds the sum over the lanes of `acc[i][j]` to `g[4 * i + j]`.
-    unsafe fn add_lane_sums<const N: usize>(acc: &[[Self::V; N]; 4], g: *mut f32);
+    /// Stores four vectors, `stride` floats apart: vector `r` holds `*from[i].add(row + r)` in lane `i`.
+    unsafe fn transpose_rows(from: &[*const f32; 16], row: usize, to: *mut f32, stride: usize);
 
     #[inline(always)]
     unsafe fn splat(x: f32) -> Self::V {

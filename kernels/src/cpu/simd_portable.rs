@@ -252,14 +252,11 @@ impl Simd for Portable {
     }
 
     #[inline(always)]
-    unsafe fn add_lane_sums<const N: usize>(acc: &[[Lanes; N]; 4], g: *mut f32) {
-        // Opaque, for the compiler would otherwise shuffle lanes inside the loop that accumulates.
-        for (i, row) in std::hint::black_box(*acc).iter().enumerate() {
-            for (j, v) in row.iter().enumerate() {
-                let x = v.0.map(f32::from_bits);
-                let sum = ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7]));
-                // SAFETY: the caller vouches for `4 * 3 + N` lanes at `g`.
-                unsafe { *g.add(4 * i + j) += sum };
+    unsafe fn transpose_rows(from: &[*const f32; 16], row: usize, to: *mut f32, stride: usize) {
+        for r in 0..4 {
+            for i in 0..LANES {
+                // SAFETY: the caller vouches for four floats from `row` on, and for eight lanes at each vector.
+                unsafe { *to.add(r * stride + i) = *from[i].add(row + r) };
             }
         }
     }

@@ -151,55 +151,27 @@ impl Simd for Avx512 {
     }
 
     #[inline(always)]
-    unsafe fn add_lane_sums<const N: usize>(acc: &[[__m512; N]; 4], g: *mut f32) {
-        // SAFETY: register operations, and the caller vouches for `4 * 3 + N` lanes at `g`.
+    unsafe fn transpose_rows(from: &[*const f32; 16], row: usize, to: *mut f32, stride: usize) {
+        // SAFETY: the caller vouches for four floats from `row` on, and for 16 lanes at each vector.
         unsafe {
-            if N == 4 {
-                let r0 = sums_of_row(acc[0][0], acc[0][1], acc[0][2], acc[0][3]);
-                let r1 = sums_of_row(acc[1][0], acc[1][1], acc[1][2], acc[1][3]);
-                let r2 = sums_of_row(acc[2][0], acc[2][1], acc[2][2], acc[2][3]);
-                let r3 = sums_of_row(acc[3][0], acc[3][1], acc[3][2], acc[3][3]);
-                // Each 128-bit quarter of `r` holds a partial sum of all four columns: a 4x4 transposition of
-                // quarters, adding instead of storing.
-                let lower = add_quarters(r0, r1);
-                let upper = add_quarters(r2, r3);
-                let even = _mm512_shuffle_f32x4::<0b10_00_10_00>(lower, upper);
-                let odd = _mm512_shuffle_f32x4::<0b11_01_11_01>(lower, upper);
-                Self::store(g, _mm512_add_ps(Self::load(g), _mm512_add_ps(even, odd)));
-            } else {
-                for i in 0..4 {
-                    for j in 0..N {
-                        *g.add(4 * i + j) += _mm512_reduce_add_ps(acc[i][j]);
-                    }
-                }
+            // Quarter q holds four rows of channel 4 q + i; inserting from memory leaves the shuffle unit alone.
+            let mut v = [_mm512_setzero_ps(); 4];
+            for i in 0..4 {
+                let quarter = |q: usize| _mm_loadu_ps(from[4 * q + i].add(row));
+                let lower = _mm512_insertf32x4::<1>(_mm512_castps128_ps512(quarter(0)), quarter(1));
+                v[i] = _mm512_insertf32x4::<3>(_mm512_insertf32x4::<2>(lower, quarter(2)), quarter(3));
+            }
+            let [a, b, c, d] = v;
+            for (r, x, y) in [
+                (0, _mm512_unpacklo_ps(a, b), _mm512_unpacklo_ps(c, d)),
+                (2, _mm512_unpackhi_ps(a, b), _mm512_unpackhi_ps(c, d)),
+            ] {
+                let (x, y) = (_mm512_castps_pd(x), _mm512_castps_pd(y));
+                Self::store(to.add(r * stride), _mm512_castpd_ps(_mm512_unpacklo_pd(x, y)));
+                Self::store(to.add((r + 1) * stride), _mm512_castpd_ps(_mm512_unpackhi_pd(x, y)));
             }
         }
     }
-}
-
-/// Quarter `q` of the result holds, at position `j`, the sum of quarter `q` of the `j`-th argument.
-///
-/// # Safety
-/// The CPU has AVX-512.
-#[inline(always)]
-unsafe fn sums_of_row(a: __m512, b: __m512, c: __m512, d: __m512) -> __m512 {
-    // SAFETY: register operations of AVX-512.
-    unsafe {
-        // [a0+a2 a1+a3 b2+b0 b3+b1] in every quarter, likewise for c and d.
-        let ab = _mm512_add_ps(_mm512_mask_blend_ps(0xcccc, a, b), _mm512_shuffle_ps::<0b01_00_11_10>(a, b));
-        let cd = _mm512_add_ps(_mm512_mask_blend_ps(0xcccc, c, d), _mm512_shuffle_ps::<0b01_00_11_10>(c, d));
-        _mm512_add_ps(_mm512_shuffle_ps::<0b10_00_10_00>(ab, cd), _mm512_shuffle_ps::<0b11_01_11_01>(ab, cd))
-    }
-}
-
-/// Quarters `[p0+p2 p1+p3 q2+q0 q3+q1]`.
-///
-/// # Safety
-/// The CPU has AVX-512.
-#[inline(always)]
-unsafe fn add_quarters(p: __m512, q: __m512) -> __m512 {
-    // SAFETY: register operations of AVX-512.
-    unsafe { _mm512_add_ps(_mm512_mask_blend_ps(0xff00, p, q), _mm512_shuffle_f32x4::<0b01_00_11_10>(p, q)) }
 }
 
 /// 8 lanes.
@@ -311,19 +283,23 @@ impl Simd for Avx2 {
     }
 
     #[inline(always)]
-    unsafe fn add_lane_sums<const N: usize>(acc: &[[__m256; N]; 4], g: *mut f32) {
-        // SAFETY: register operations, and the caller vouches for `4 * 3 + N` lanes at `g`.
+    unsafe fn transpose_rows(from: &[*const f32; 16], row: usize, to: *mut f32, stride: usize) {
+        // SAFETY: the caller vouches for four floats from `row` on, and for 8 lanes at each vector.
         unsafe {
-            for j in 0..N {
-                let ab = _mm256_hadd_ps(acc[0][j], acc[1][j]);
-                let cd = _mm256_hadd_ps(acc[2][j], acc[3][j]);
-                let halves = _mm256_hadd_ps(ab, cd);
-                let sums = _mm_add_ps(_mm256_castps256_ps128(halves), _mm256_extractf128_ps::<1>(halves));
-                let mut column = [0.0f32; 4];
-                _mm_storeu_ps(column.as_mut_ptr(), sums);
-                for i in 0..4 {
-                    *g.add(4 * i + j) += column[i];
-                }
+            // Half h holds four rows of channel 4 h + i.
+            let mut v = [_mm256_setzero_ps(); 4];
+            for i in 0..4 {
+                let half = |h: usize| _mm_loadu_ps(from[4 * h + i].add(row));
+                v[i] = _mm256_insertf128_ps::<1>(_mm256_castps128_ps256(half(0)), half(1));
+            }
+            let [a, b, c, d] = v;
+            for (r, x, y) in [
+                (0, _mm256_unpacklo_ps(a, b), _mm256_unpacklo_ps(c, d)),
+                (2, _mm256_unpackhi_ps(a, b), _mm256_unpackhi_ps(c, d)),
+            ] {
+                let (x, y) = (_mm256_castps_pd(x), _mm256_castps_pd(y));
+                Self::store(to.add(r * stride), _mm256_castpd_ps(_mm256_unpacklo_pd(x, y)));
+                Self::store(to.add((r + 1) * stride), _mm256_castpd_ps(_mm256_unpackhi_pd(x, y)));
             }
         }
     }

@@ -436,7 +436,8 @@ impl Lowering<'_> {
                 let at = self.accumulator(*buffer, Reduction::Sum, Some((k, n, view.elements)));
                 let (d, d_copy) = self.side_by_side(*d, true);
                 copies.extend(d_copy);
-                let parts = self.apart(*x, |first| first % outer::BLOCK == 0).unwrap_or_else(|| {
+                let fits = |first: usize| first.is_multiple_of(outer::PANEL) || !outer::x_along_vectors(k, n);
+                let parts = self.apart(*x, fits).unwrap_or_else(|| {
                     let (place, x_copy) = self.side_by_side(*x, true);
                     copies.extend(x_copy);
                     vec![(place, 0, k)]

@@ -215,7 +215,7 @@ pub enum TileStore {
         view: View,
         at: usize,
     },
-    /// Blocked accumulators (see [`super::outer`]), one per element of the buffer, at `at`.
+    /// Accumulators in panels (see [`mod@super::outer`]), one per element of the buffer, at `at`.
     Outer {
         /// Stretches of x: place, first channel, channels.
         parts: Vec<(Place, usize, usize)>,

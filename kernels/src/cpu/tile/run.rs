@@ -433,7 +433,7 @@ impl Tile<'_> {
                 TileStore::Reduce { kind, value, view, at } => self.reduce(*kind, value, view, *at),
                 TileStore::Outer { parts, k, d, n, view, at } => {
                     let ld = self.program.ld;
-                    let rows = self.rows.next_multiple_of(16);
+                    let rows = self.rows.next_multiple_of(crate::cpu::outer::ROWS);
                     let element: usize = self.position.iter().zip(&view.outer).map(|(p, s)| p * s).sum();
                     let g = self.accumulators.add(at + element * crate::cpu::outer_len(*k, *n));
                     self.clear_padding(*d, *n, rows);
@@ -443,11 +443,13 @@ impl Tile<'_> {
                             x: self.at(*x),
                             ldx: ld,
                             k: *channels,
+                            first: *first,
+                            channels: *k,
                             d: self.at(*d),
                             ldd: ld,
                             n: *n,
                             rows,
-                            g: g.add(crate::cpu::outer_len(*first, *n)),
+                            g,
                         };
                         outer(self.isa, args);
                     }
