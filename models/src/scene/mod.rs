@@ -13,6 +13,8 @@ mod folder;
 mod frame;
 mod json;
 mod llff;
+pub mod make_scene;
+pub mod noise;
 mod normalise;
 mod numpy;
 mod picture;
@@ -21,6 +23,7 @@ mod transforms;
 
 pub use error::SceneError;
 pub use frame::WorldFrame;
+pub use noise::{InitialPoses, NoiseError, PoseStart};
 
 use crate::geometry::Pose;
 use picture::{DepthFile, read_view};

@@ -5,3 +5,4 @@ mod fits;
 mod networks;
 mod planar;
 mod primitives;
+mod scenes;
