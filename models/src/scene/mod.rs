@@ -5,15 +5,32 @@
 //! z = 1 that it shows is ((j + 0.5 - cx) / fx, (i + 0.5 - cy) / fy, 1). Images are pinhole images: lens distortion is
 //! removed while loading. [`WorldFrame`] leads back to the world of the files.
 
+mod blender;
+mod colmap;
+mod dtu;
 mod error;
+mod folder;
 mod frame;
+mod json;
+mod llff;
+pub mod make_scene;
+pub mod noise;
+mod normalise;
+mod numpy;
+mod picture;
+mod resize;
+mod transforms;
 
 pub use error::SceneError;
 pub use frame::WorldFrame;
+pub use noise::{InitialPoses, NoiseError, PoseStart};
 
 use crate::geometry::Pose;
+use picture::{DepthFile, read_view};
+use rayon::prelude::*;
 use std::fmt;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// A pinhole camera, in pixels of an image of `height` x `width`.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -81,8 +98,10 @@ pub enum Layout {
 }
 
 impl Layout {
+    /// In the order in which they are tried: files made for training come before those of reconstruction programs, which
+    /// often lie beside them.
     pub const ALL: [Layout; 6] =
-        [Layout::Blender, Layout::Transforms, Layout::Dtu, Layout::Colmap, Layout::Llff, Layout::Folder];
+        [Layout::Blender, Layout::Transforms, Layout::Dtu, Layout::Llff, Layout::Colmap, Layout::Folder];
 
     pub fn name(self) -> &'static str {
         match self {
@@ -144,6 +163,61 @@ pub struct Scene {
     pub frame: WorldFrame,
     /// Lens distortion that was removed (of the first view; see [`Intrinsics::distortion`]).
     pub removed_distortion: Option<[f64; 4]>,
+    /// What had to be assumed, a sentence each.
+    pub notes: Vec<String>,
+}
+
+/// What a layout says of one view before any pixel is read.
+struct Entry {
+    name: String,
+    image: PathBuf,
+    mask: Option<PathBuf>,
+    depth: Option<DepthFile>,
+    /// For the image file's own size.
+    intrinsics: Intrinsics,
+    /// In the world of the files.
+    pose: Option<Pose>,
+}
+
+/// What a layout says of a scene.
+struct Listing {
+    train: Vec<Entry>,
+    /// `None`: the test views.
+    val: Option<Vec<Entry>>,
+    test: Vec<Entry>,
+    depth: DepthRange,
+    frame: WorldFrame,
+    notes: Vec<String>,
+}
+
+/// Images of which some are set aside must be at least so many.
+const LEAST_TO_SPLIT: usize = 10;
+
+impl Layout {
+    /// What of this layout the folder lacks; `None` if it looks like one.
+    fn lacks(self, root: &Path) -> Option<String> {
+        match self {
+            Layout::Blender => blender::lacks(root),
+            Layout::Llff => llff::lacks(root),
+            Layout::Dtu => dtu::lacks(root),
+            Layout::Transforms => transforms::lacks(root),
+            Layout::Colmap => colmap::lacks(root),
+            Layout::Folder => folder::lacks(root),
+        }
+    }
+
+    /// The layout of a folder.
+    pub fn of(root: &Path) -> Result<Layout, SceneError> {
+        std::fs::read_dir(root).map_err(|source| SceneError::Read { path: root.into(), source })?;
+        let mut tried = vec![];
+        for layout in Layout::ALL {
+            match layout.lacks(root) {
+                None => return Ok(layout),
+                Some(lacks) => tried.push((layout, lacks)),
+            }
+        }
+        Err(SceneError::NotAScene { root: root.into(), tried })
+    }
 }
 
 /// Loads the scene in the folder `root`. `progress` hears how many of how many images are there, from any thread.
@@ -152,8 +226,125 @@ pub struct Scene {
 /// Files that are missing or damaged, metadata that make no sense, too few images to split, images of different sizes
 /// where no size is asked for, a folder that holds no scene.
 pub fn load(root: &Path, options: &LoadOptions, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<Scene, SceneError> {
-    let _ = (options, progress);
-    Err(SceneError::NotAScene { root: root.into(), tried: vec![] })
+    let layout = match options.layout {
+        Some(layout) => match layout.lacks(root) {
+            Some(lacks) => return Err(SceneError::NotAScene { root: root.into(), tried: vec![(layout, lacks)] }),
+            None => layout,
+        },
+        None => Layout::of(root)?,
+    };
+    let mut listing = match layout {
+        Layout::Blender => blender::list(root),
+        Layout::Llff => llff::list(root, options),
+        Layout::Dtu => dtu::list(root),
+        Layout::Transforms => transforms::list(root),
+        Layout::Colmap => colmap::list(root),
+        Layout::Folder => folder::list(root, options),
+    }?;
+    let limit = |entries: &mut Vec<Entry>, n: Option<usize>| entries.truncate(n.unwrap_or(usize::MAX));
+    limit(&mut listing.train, options.train_limit);
+    limit(&mut listing.test, options.test_limit);
+    if let Some(val) = &mut listing.val {
+        limit(val, options.val_limit);
+    }
+    let depth = options.depth.unwrap_or(listing.depth);
+    check_depth(depth, if options.depth.is_some() { "the options" } else { layout.name() })?;
+    let (trained, own_val) = (listing.train.len(), listing.val.as_ref().map_or(0, Vec::len));
+    let entries: Vec<&Entry> = listing.train.iter().chain(listing.val.iter().flatten()).chain(&listing.test).collect();
+    if trained == 0 {
+        return Err(SceneError::TooFew { root: root.into(), found: 0, least: 1 });
+    }
+    if options.size.is_none() {
+        check_sizes(&entries)?;
+    }
+    let done = AtomicUsize::new(0);
+    let read = |entry: &&Entry| {
+        let view = read_view(entry, &listing.frame, options)?;
+        progress(done.fetch_add(1, Ordering::Relaxed) + 1, entries.len());
+        Ok(view)
+    };
+    let views: Result<Vec<(View, bool)>, SceneError> = entries.par_iter().map(read).collect();
+    let views = views?;
+    let transparent = views.iter().any(|v| v.1);
+    let mut views: Vec<View> = views.into_iter().map(|v| v.0).collect();
+    let test = views.split_off(trained + own_val);
+    let val = match listing.val {
+        Some(_) => views.split_off(trained),
+        None => test.iter().take(options.val_limit.unwrap_or(usize::MAX)).cloned().collect(),
+    };
+    Ok(Scene {
+        layout,
+        root: root.into(),
+        val,
+        test,
+        depth,
+        background: transparent.then(|| options.background.unwrap_or(WHITE)),
+        frame: listing.frame,
+        removed_distortion: listing.train[0].intrinsics.distortion.filter(|d| d.iter().any(|k| *k != 0.0)),
+        notes: listing.notes,
+        train: views,
+    })
+}
+
+const WHITE: [f64; 3] = [1.0; 3];
+
+fn check_depth(depth: DepthRange, from: &str) -> Result<(), SceneError> {
+    let (near, far) = match depth {
+        DepthRange::Metric { near, far } => (near, far),
+        DepthRange::Inverse { near } => (near, f64::INFINITY),
+    };
+    // Written so that anything that is no number fails.
+    let usable = near > 0.0 && near < far && (far.is_finite() || matches!(depth, DepthRange::Inverse { .. }));
+    if usable { Ok(()) } else { Err(SceneError::Depth { from: from.to_string(), near, far }) }
+}
+
+fn check_sizes(entries: &[&Entry]) -> Result<(), SceneError> {
+    let size = |e: &Entry| [e.intrinsics.height, e.intrinsics.width];
+    let Some(first) = entries.first() else { return Ok(()) };
+    match entries.iter().find(|e| size(e) != size(first)) {
+        None => Ok(()),
+        Some(other) => Err(SceneError::MixedSizes {
+            path: other.image.clone(),
+            found: size(other),
+            first: first.image.clone(),
+            expected: size(first),
+        }),
+    }
+}
+
+/// Refuses a pose of a file that has something else than finite numbers in it, or no rotation.
+fn check_pose(pose: Pose, path: &Path, field: impl Fn() -> String) -> Result<Pose, SceneError> {
+    let refuse = |expected: &str, found: String| {
+        Err(SceneError::Field { path: path.into(), field: field(), expected: expected.into(), found })
+    };
+    if let Some(x) = pose.to_rows().iter().find(|x| !x.is_finite()) {
+        return refuse("finite numbers", x.to_string());
+    }
+    match pose.rigidity_error() {
+        e if e.is_infinite() => refuse("a rotation", "a reflection or a singular matrix".into()),
+        e if e > 1e-3 => refuse("a rotation", format!("a matrix with R R^T off the identity by {e:.1e}")),
+        _ => Ok(pose),
+    }
+}
+
+/// Every nth of a list, from the first on, set aside: (the others, the chosen).
+fn every<T>(n: usize, all: Vec<T>) -> (Vec<T>, Vec<T>) {
+    let (chosen, others): (Vec<_>, Vec<_>) = all.into_iter().enumerate().partition(|(i, _)| i % n == 0);
+    let strip = |list: Vec<(usize, T)>| list.into_iter().map(|(_, x)| x).collect();
+    (strip(others), strip(chosen))
+}
+
+/// The last tenth of a list set aside: (the others, the last).
+fn last_tenth<T>(mut all: Vec<T>) -> (Vec<T>, Vec<T>) {
+    let last = all.split_off(all.len() - all.len() / 10);
+    (all, last)
+}
+
+fn enough_to_split(root: &Path, found: usize) -> Result<(), SceneError> {
+    if found < LEAST_TO_SPLIT {
+        return Err(SceneError::TooFew { root: root.into(), found, least: LEAST_TO_SPLIT });
+    }
+    Ok(())
 }
 
 #[cfg(test)]

@@ -7,4 +7,5 @@ mod networks;
 mod planar;
 mod primitives;
 mod rendering;
+mod scenes;
 mod space;
