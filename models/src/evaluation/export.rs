@@ -15,7 +15,7 @@ use std::path::Path;
 
 /// One camera as it is written out.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Camera {
+pub struct ExportCamera {
     /// The picture's file name, as other programs look for it.
     pub name: String,
     pub width: usize,
@@ -41,7 +41,7 @@ pub enum ExportError {
     Write(#[from] WriteError),
 }
 
-fn check(cameras: &[Camera]) -> Result<(), ExportError> {
+fn check(cameras: &[ExportCamera]) -> Result<(), ExportError> {
     let poses: Vec<Pose> = cameras.iter().map(|c| c.pose).collect();
     check_poses("exported", &poses)?;
     for (view, c) in cameras.iter().enumerate() {
@@ -66,9 +66,9 @@ fn flip() -> Matrix3<f64> {
 ///
 /// # Errors
 /// If a camera is none.
-pub fn transforms_json(cameras: &[Camera]) -> Result<String, ExportError> {
+pub fn transforms_json(cameras: &[ExportCamera]) -> Result<String, ExportError> {
     check(cameras)?;
-    let lens = |c: &Camera| {
+    let lens = |c: &ExportCamera| {
         let [fx, fy] = c.focal;
         json!({
             "camera_angle_x": 2.0 * (c.width as f64 / (2.0 * fx)).atan(),
@@ -76,7 +76,7 @@ pub fn transforms_json(cameras: &[Camera]) -> Result<String, ExportError> {
             "fl_x": fx, "fl_y": fy, "cx": c.principal[0], "cy": c.principal[1], "w": c.width, "h": c.height,
         })
     };
-    let frame = |c: &Camera| {
+    let frame = |c: &ExportCamera| {
         let world = c.pose.inverse();
         let axes = world.rotation * flip();
         let row = |i: usize| json!([axes[(i, 0)], axes[(i, 1)], axes[(i, 2)], world.translation[i]]);
@@ -103,9 +103,9 @@ pub struct Colmap {
 impl Colmap {
     /// # Errors
     /// If a camera is none, or its name has a line break, which the format cannot hold.
-    pub fn new(cameras: &[Camera]) -> Result<Colmap, ExportError> {
+    pub fn new(cameras: &[ExportCamera]) -> Result<Colmap, ExportError> {
         check(cameras)?;
-        let mut lenses: Vec<&Camera> = vec![];
+        let mut lenses: Vec<&ExportCamera> = vec![];
         let mut out = Colmap {
             cameras: "# Camera list: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n".into(),
             images: "# Image list, two lines each: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; POINTS2D[]\n"
@@ -117,8 +117,9 @@ impl Colmap {
                 let problem = "COLMAP's text format has no line breaks in names".to_string();
                 return Err(ExportError::Camera { view, name: c.name.clone(), problem });
             }
-            let same =
-                |o: &&Camera| (o.width, o.height, o.focal, o.principal) == (c.width, c.height, c.focal, c.principal);
+            let same = |o: &&ExportCamera| {
+                (o.width, o.height, o.focal, o.principal) == (c.width, c.height, c.focal, c.principal)
+            };
             let lens = lenses.iter().position(same).unwrap_or_else(|| {
                 lenses.push(c);
                 lenses.len() - 1
@@ -167,7 +168,7 @@ const LENS: f64 = 1e-3;
 /// # Errors
 /// If a camera is none, has no bounds, two focal lengths, or a principal point off the middle of the picture: the format
 /// has no place for those.
-pub fn poses_bounds(cameras: &[Camera]) -> Result<Vec<u8>, ExportError> {
+pub fn poses_bounds(cameras: &[ExportCamera]) -> Result<Vec<u8>, ExportError> {
     check(cameras)?;
     let mut numbers: Vec<f64> = Vec::with_capacity(17 * cameras.len());
     for (view, c) in cameras.iter().enumerate() {
@@ -208,8 +209,8 @@ mod tests {
     use super::*;
     use nalgebra::{Quaternion, Vector3};
 
-    fn cameras() -> Vec<Camera> {
-        let camera = |i: usize| Camera {
+    fn cameras() -> Vec<ExportCamera> {
+        let camera = |i: usize| ExportCamera {
             name: format!("images/IMG {i}.JPG"),
             width: 640,
             height: 480,
@@ -288,7 +289,7 @@ mod tests {
 
     #[test]
     fn cameras_that_do_not_fit_a_format_are_refused() {
-        let with = |change: fn(&mut Camera)| {
+        let with = |change: fn(&mut ExportCamera)| {
             let mut cameras = cameras();
             change(&mut cameras[1]);
             cameras
