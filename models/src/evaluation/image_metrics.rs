@@ -170,8 +170,8 @@ pub struct DepthErrors {
 
 /// Compares `scale` times a rendered depth map with the true one where `valid` is true, pixel by pixel.
 ///
-/// `scale` is that of the alignment ([`Similarity::scale`](super::Similarity)). Sums are divided by the number of valid
-/// pixels plus 1e-6, as INN's code does.
+/// `scale` is that of the alignment ([`Similarity::scale`](super::Similarity)). As in INN's code the absolute differences are
+/// divided by the number of valid pixels plus 1e-6.
 ///
 /// # Errors
 /// If the three lists differ in length, no pixel is valid, or a valid depth is not finite (`row` is zero then and `column`
@@ -191,8 +191,10 @@ pub fn depth_errors(depth: &[f32], truth: &[f32], valid: &[bool], scale: f64) ->
         }
         (n, sum, squares) = (n + 1, sum + off.abs(), squares + off * off);
     }
-    let count = n as f64 + 1e-6;
-    if n == 0 { Err(ImageError::NoDepth) } else { Ok(DepthErrors { abs: sum / count, rms: (squares / count).sqrt() }) }
+    if n == 0 {
+        return Err(ImageError::NoDepth);
+    }
+    Ok(DepthErrors { abs: sum / (n as f64 + 1e-6), rms: (squares / n as f64).sqrt() })
 }
 
 /// What INN's program returns: of each error the smaller with and without the scale.
