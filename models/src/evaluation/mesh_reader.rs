@@ -1,9 +1,9 @@
-//! Reading reference surfaces: PLY files of triangles, polygons or points alone, text or binary.
+//! Reading reference surfaces: PLY files (Turk 1994) of triangles, polygons or points alone, text or little endian binary.
+//!
+//! A file says in its head which elements it has and which numbers each of them; what is neither a vertex' position nor a
+//! face's corners is skipped. Not a crate: the kept one brings features into the GPU backend's build.
 
 use super::mesh::Mesh;
-use ply_rs_bw::parser::{Parser, Reader};
-use ply_rs_bw::ply::{DefaultElement, Property, PropertyAccess, PropertyAccessResult};
-use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 
 /// A file that is no surface.
@@ -15,72 +15,123 @@ pub enum MeshFileError {
     Format { path: PathBuf, problem: String },
 }
 
-/// A vertex as it is read; NaN where the file does not say.
-struct Vertex([f64; 3]);
-
-impl PropertyAccess for Vertex {
-    fn new() -> Vertex {
-        Vertex([f64::NAN; 3])
-    }
-    fn set_property(&mut self, name: &str, value: Property) -> PropertyAccessResult {
-        let Some(i) = ["x", "y", "z"].iter().position(|axis| *axis == name) else {
-            return PropertyAccessResult::Ignored;
-        };
-        self.0[i] = match value {
-            Property::Float(v) => f64::from(v),
-            Property::Double(v) => v,
-            _ => return PropertyAccessResult::UnsupportedType,
-        };
-        PropertyAccessResult::Set
-    }
-}
-
-/// Corners of a polygon.
-struct Face(Vec<u32>);
-
-impl PropertyAccess for Face {
-    fn new() -> Face {
-        Face(vec![])
-    }
-    fn set_property(&mut self, name: &str, value: Property) -> PropertyAccessResult {
-        if !matches!(name, "vertex_indices" | "vertex_index") {
-            return PropertyAccessResult::Ignored;
-        }
-        let Some(corners) = value.to_u32_list() else { return PropertyAccessResult::UnsupportedType };
-        self.0 = corners;
-        PropertyAccessResult::Set
-    }
-}
-
 impl Mesh {
     /// A mesh, or a cloud of points as a mesh without triangles. Polygons are cut into triangles from their first corner.
     ///
     /// # Errors
-    /// If the file cannot be read, is no PLY, has no vertices with finite `x`, `y`, `z`, or faces with corners it lacks.
+    /// If the file cannot be read, is no PLY in text or little endian binary, has no vertices with finite `x`, `y`, `z`,
+    /// or faces with corners it lacks.
     pub fn read_ply(path: &Path) -> Result<Mesh, MeshFileError> {
-        let file = std::fs::File::open(path).map_err(|source| MeshFileError::Read { path: path.into(), source })?;
-        parse(BufReader::new(file)).map_err(|problem| MeshFileError::Format { path: path.into(), problem })
+        let bytes = std::fs::read(path).map_err(|source| MeshFileError::Read { path: path.into(), source })?;
+        parse(&bytes).map_err(|problem| MeshFileError::Format { path: path.into(), problem })
     }
 }
 
-fn parse(source: impl BufRead) -> Result<Mesh, String> {
-    let mut reader = Reader::new(source);
-    let vertices = Parser::<Vertex>::new();
-    let header = vertices.read_header(&mut reader).map_err(|e| e.to_string())?;
-    let (mut mesh, mut faces) = (Mesh::default(), vec![]);
-    for (name, element) in &header.elements {
-        match name.as_str() {
-            "vertex" => {
-                let found = vertices.read_payload_for_element(&mut reader, element, &header);
-                mesh.vertices = found.map_err(|e| e.to_string())?.into_iter().map(|v| v.0).collect();
+/// A type of number.
+#[derive(Clone, Copy, Debug)]
+enum Number {
+    Signed(usize),
+    Unsigned(usize),
+    Float,
+    Double,
+}
+
+impl Number {
+    fn from_name(name: &str) -> Result<Number, String> {
+        match name {
+            "char" | "int8" => Ok(Number::Signed(1)),
+            "short" | "int16" => Ok(Number::Signed(2)),
+            "int" | "int32" => Ok(Number::Signed(4)),
+            "uchar" | "uint8" => Ok(Number::Unsigned(1)),
+            "ushort" | "uint16" => Ok(Number::Unsigned(2)),
+            "uint" | "uint32" => Ok(Number::Unsigned(4)),
+            "float" | "float32" => Ok(Number::Float),
+            "double" | "float64" => Ok(Number::Double),
+            other => Err(format!("its head names the unknown type `{other}`")),
+        }
+    }
+    fn size(self) -> usize {
+        match self {
+            Number::Signed(n) | Number::Unsigned(n) => n,
+            Number::Float => 4,
+            Number::Double => 8,
+        }
+    }
+    fn value(self, bytes: &[u8]) -> f64 {
+        let mut all = [0u8; 8];
+        all[..bytes.len()].copy_from_slice(bytes);
+        let bits = u64::from_le_bytes(all);
+        match self {
+            // Shifted up and down again, so that the sign is that of the few bytes.
+            Number::Signed(n) => ((bits << (64 - 8 * n)) as i64 >> (64 - 8 * n)) as f64,
+            Number::Unsigned(_) => bits as f64,
+            Number::Float => f64::from(f32::from_bits(bits as u32)),
+            Number::Double => f64::from_bits(bits),
+        }
+    }
+}
+
+/// One property of an element: a number, or a list with its length before it.
+struct Property {
+    name: String,
+    length: Option<Number>,
+    number: Number,
+}
+
+struct Element {
+    name: String,
+    count: usize,
+    properties: Vec<Property>,
+}
+
+/// Gives the numbers of the body, one after the other.
+enum Body<'a> {
+    Text(std::str::SplitAsciiWhitespace<'a>),
+    Binary(&'a [u8]),
+}
+
+impl Body<'_> {
+    fn next(&mut self, number: Number) -> Result<f64, String> {
+        match self {
+            Body::Text(words) => {
+                let word = words.next().ok_or("it ends before its last element")?;
+                word.parse().map_err(|_| format!("it has `{word}` where a number belongs"))
             }
-            "face" => {
-                let found = Parser::<Face>::new().read_payload_for_element(&mut reader, element, &header);
-                faces = found.map_err(|e| e.to_string())?;
+            Body::Binary(rest) => {
+                let (bytes, after) = rest.split_at_checked(number.size()).ok_or("it ends before its last element")?;
+                *rest = after;
+                Ok(number.value(bytes))
             }
-            _ => {
-                let other = Parser::<DefaultElement>::new();
-                other.read_payload_for_element(&mut reader, element, &header).map_err(|e| e.to_string())?;
+        }
+    }
+
+    /// The values of a property.
+    fn values(&mut self, property: &Property) -> Result<Vec<f64>, String> {
+        let length = property.length.map_or(Ok(1.0), |n| self.next(n))?;
+        (0..length as usize).map(|_| self.next(property.number)).collect()
+    }
+}
+
+fn parse(bytes: &[u8]) -> Result<Mesh, String> {
+    let (elements, mut body) = head(bytes)?;
+    let mut mesh = Mesh::default();
+    let mut faces: Vec<Vec<f64>> = vec![];
+    // Elements without properties take no room, however many there are said to be.
+    for element in elements.iter().filter(|e| !e.properties.is_empty()) {
+        for _ in 0..element.count {
+            let mut position = [f64::NAN; 3];
+            for property in &element.properties {
+                let values = body.values(property)?;
+                match (element.name.as_str(), property.name.as_str()) {
+                    ("vertex", axis @ ("x" | "y" | "z")) => {
+                        position[usize::from(axis.as_bytes()[0] - b'x')] = values.first().copied().unwrap_or(f64::NAN);
+                    }
+                    ("face", "vertex_indices" | "vertex_index") => faces.push(values),
+                    _ => {}
+                }
+            }
+            if element.name == "vertex" {
+                mesh.vertices.push(position);
             }
         }
     }
@@ -88,15 +139,63 @@ fn parse(source: impl BufRead) -> Result<Mesh, String> {
         return Err("it has no vertices".into());
     }
     if let Some(i) = mesh.vertices.iter().position(|v| v.iter().any(|x| !x.is_finite())) {
-        return Err(format!("vertex {i} has no finite x, y and z as floats or doubles"));
+        return Err(format!("vertex {i} has no finite x, y and z"));
     }
-    for (i, Face(corners)) in faces.into_iter().enumerate() {
-        if let Some(bad) = corners.iter().find(|c| **c as usize >= mesh.vertices.len()) {
-            return Err(format!("face {i} has the corner {bad}, and there are {} vertices", mesh.vertices.len()));
+    let count = mesh.vertices.len();
+    for (i, corners) in faces.iter().enumerate() {
+        let is_vertex = |c: &f64| c.fract() == 0.0 && (0.0..count as f64).contains(c);
+        if let Some(bad) = corners.iter().find(|c| !is_vertex(c)) {
+            return Err(format!("face {i} has the corner {bad}, and there are {count} vertices"));
         }
-        mesh.triangles.extend((2..corners.len()).map(|j| [corners[0], corners[j - 1], corners[j]]));
+        let at = |j: usize| corners[j] as u32;
+        mesh.triangles.extend((2..corners.len()).map(|j| [at(0), at(j - 1), at(j)]));
     }
     Ok(mesh)
+}
+
+/// The elements the head tells of, and what follows it.
+fn head(bytes: &[u8]) -> Result<(Vec<Element>, Body<'_>), String> {
+    let (mut elements, mut binary, mut rest) = (Vec::<Element>::new(), None, bytes);
+    let mut first = true;
+    loop {
+        let end = rest.iter().position(|b| *b == b'\n').ok_or("its head has no end")?;
+        let line = std::str::from_utf8(&rest[..end]).map_err(|_| "its head is no text")?;
+        rest = &rest[end + 1..];
+        let words: Vec<&str> = line.split_ascii_whitespace().collect();
+        if std::mem::take(&mut first) {
+            if words != ["ply"] {
+                return Err("its first line is not `ply`".into());
+            }
+            continue;
+        }
+        match words[..] {
+            ["format", "ascii", _] => binary = Some(false),
+            ["format", "binary_little_endian", _] => binary = Some(true),
+            ["format", other, ..] => return Err(format!("its format is `{other}`, not ascii or binary_little_endian")),
+            ["element", name, count] => {
+                let count = count.parse().map_err(|_| format!("`{line}` has no count"))?;
+                elements.push(Element { name: name.into(), count, properties: vec![] });
+            }
+            ["property", ref property @ ..] => {
+                let element = elements.last_mut().ok_or("its head has a property before any element")?;
+                let (name, length, number) = match *property {
+                    ["list", length, number, name] => (name, Some(Number::from_name(length)?), number),
+                    [number, name] => (name, None, number),
+                    _ => return Err(format!("its head has the line `{line}`")),
+                };
+                element.properties.push(Property { name: name.into(), length, number: Number::from_name(number)? });
+            }
+            ["end_header"] => break,
+            [] | ["comment" | "obj_info", ..] => {}
+            _ => return Err(format!("its head has the line `{line}`")),
+        }
+    }
+    let body = if binary.ok_or("its head has no format")? {
+        Body::Binary(rest)
+    } else {
+        Body::Text(std::str::from_utf8(rest).map_err(|_| "its body is no text")?.split_ascii_whitespace())
+    };
+    Ok((elements, body))
 }
 
 #[cfg(test)]
@@ -133,9 +232,11 @@ mod tests {
         assert_eq!(square.triangles, [[0, 1, 2], [0, 2, 3]]);
         let corners = |line: &str| read(&format!("{head}{list}{points}{line}\n"));
         assert!(corners("3 0 1 4").unwrap_err().contains("face 0 has the corner 4"));
-        assert!(corners("3 0 1 -1").is_err());
+        assert!(corners("3 0 1 -1").unwrap_err().contains("the corner -1"));
         assert!(read(&format!("{head}end_header\n0 0 0 9\n")).is_err());
-        assert!(read("solid no ply").is_err());
+        assert!(read("solid no ply\n").unwrap_err().contains("`ply`"));
+        assert!(read("ply\nformat binary_big_endian 1.0\nend_header\n").unwrap_err().contains("big_endian"));
+        assert!(read("ply\nelement vertex 1\nproperty half x\nend_header\n").unwrap_err().contains("`half`"));
         let flat = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nend_header\n0 0\n";
         assert!(read(flat).unwrap_err().contains("vertex 0"));
     }
