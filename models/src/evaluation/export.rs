@@ -1,8 +1,8 @@
 //! Poses for other programs: `transforms.json` (NeRF, instant-ngp, nerfstudio), COLMAP text, LLFF `poses_bounds.npy`.
 //!
 //! The poses are written in the frame and scale they come in: give poses aligned to the reference
-//! ([`Similarity::align`](super::Similarity::align)) or those of the learned frame. A loader that recentres or flips the
-//! world (LLFF's does) has to be undone by the caller first.
+//! ([`Similarity::align`](super::Similarity::align)) or those of the learned frame. A loader that recentres or flips
+//! the world (LLFF's does) has to be undone by the caller first.
 
 use super::align::{PoseSetError, check_poses};
 use crate::geometry::Pose;
@@ -61,8 +61,8 @@ fn flip() -> Matrix3<f64> {
     Matrix3::new(1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0)
 }
 
-/// `transforms.json`: camera to world with OpenGL's camera axes, focal lengths and principal point per frame, and those of
-/// the first frame for the whole, with `camera_angle_x = 2 atan(w / (2 fl_x))`.
+/// `transforms.json`: camera to world with OpenGL's camera axes, focal lengths and principal point per frame, and those
+/// of the first frame for the whole, with `camera_angle_x = 2 atan(w / (2 fl_x))`.
 ///
 /// # Errors
 /// If a camera is none.
@@ -91,8 +91,8 @@ pub fn transforms_json(cameras: &[ExportCamera]) -> Result<String, ExportError> 
     Ok(serde_json::to_string_pretty(&all).unwrap_or_default())
 }
 
-/// The three files of a COLMAP text model. Poses are world to camera, as here; cameras are `PINHOLE`, one for all pictures
-/// that share size and lens. There are no points: `points3D.txt` has a head only.
+/// The three files of a COLMAP text model. Poses are world to camera, as here; cameras are `PINHOLE`, one for all
+/// pictures that share size and lens. There are no points: `points3D.txt` has a head only.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Colmap {
     pub cameras: String,
@@ -162,12 +162,12 @@ impl Colmap {
 /// Share of a pixel that focal lengths or centres may differ by where a format has one number for both.
 const LENS: f64 = 1e-3;
 
-/// LLFF's `poses_bounds.npy`: per picture 17 doubles, the 3 x 5 matrix `[down, right, back, centre, (height, width, focal)]`
-/// row by row, then the nearest and farthest depth.
+/// LLFF's `poses_bounds.npy`: per picture 17 doubles, the 3 x 5 matrix of the columns down, right, back, centre and
+/// (height, width, focal) row by row, then the nearest and farthest depth.
 ///
 /// # Errors
-/// If a camera is none, has no bounds, two focal lengths, or a principal point off the middle of the picture: the format
-/// has no place for those.
+/// If a camera is none, has no bounds, two focal lengths, or a principal point off the middle of the picture: the
+/// format has no place for those.
 pub fn poses_bounds(cameras: &[ExportCamera]) -> Result<Vec<u8>, ExportError> {
     check(cameras)?;
     let mut numbers: Vec<f64> = Vec::with_capacity(17 * cameras.len());

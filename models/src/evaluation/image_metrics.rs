@@ -12,7 +12,10 @@ use rayon::prelude::*;
 pub enum ImageError {
     #[error("{what} has {found} values, not the {expected} of {width} x {height} pixels (width x height)")]
     Length { what: &'static str, width: usize, height: usize, expected: usize, found: usize },
-    #[error("the pictures have {} x {} and {} x {} pixels (width x height); they must be of one size", .a[0], .a[1], .b[0], .b[1])]
+    #[error(
+        "the pictures have {} x {} and {} x {} pixels (width x height); they must be of one size",
+        .a[0], .a[1], .b[0], .b[1]
+    )]
     Sizes { a: [usize; 2], b: [usize; 2] },
     #[error("{what} has no pixels")]
     Empty { what: &'static str },
@@ -170,12 +173,12 @@ pub struct DepthErrors {
 
 /// Compares `scale` times a rendered depth map with the true one where `valid` is true, pixel by pixel.
 ///
-/// `scale` is that of the alignment ([`Similarity::scale`](super::Similarity)). As in INN's code the absolute differences are
-/// divided by the number of valid pixels plus 1e-6.
+/// `scale` is that of the alignment ([`Similarity::scale`](super::Similarity)). As in INN's code the absolute
+/// differences are divided by the number of valid pixels plus 1e-6.
 ///
 /// # Errors
-/// If the three lists differ in length, no pixel is valid, or a valid depth is not finite (`row` is zero then and `column`
-/// the index in the list).
+/// If the three lists differ in length, no pixel is valid, or a valid depth is not finite (`row` is zero then and
+/// `column` the index in the list).
 pub fn depth_errors(depth: &[f32], truth: &[f32], valid: &[bool], scale: f64) -> Result<DepthErrors, ImageError> {
     for (what, found) in [("the true depth map", truth.len()), ("the mask of valid depths", valid.len())] {
         if found != depth.len() {
@@ -233,8 +236,8 @@ mod tests {
     }
 
     /// Numbers of scikit-image 0.26 on the same pictures within ten pixels of zeros: `structural_similarity` with
-    /// `gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, full=True`, its map cut back to the
-    /// picture, and `peak_signal_noise_ratio`.
+    /// `gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, full=True`, its map cut back to
+    /// the picture, and `peak_signal_noise_ratio`.
     #[test]
     fn psnr_and_ssim_of_scikit_image() {
         for (w, h, similarity, ratio) in [

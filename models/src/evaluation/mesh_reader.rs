@@ -1,7 +1,8 @@
-//! Reading reference surfaces: PLY files (Turk 1994) of triangles, polygons or points alone, text or little endian binary.
+//! Reading reference surfaces: PLY files (Turk 1994) of triangles, polygons or points alone, text or little endian
+//! binary.
 //!
-//! A file says in its head which elements it has and which numbers each of them; what is neither a vertex' position nor a
-//! face's corners is skipped. Not a crate: the kept one brings features into the GPU backend's build.
+//! A file says in its head which elements it has and which numbers each of them; what is neither a vertex' position nor
+//! a face's corners is skipped. Not a crate: the kept one brings features into the GPU backend's build.
 
 use super::mesh::Mesh;
 use std::path::{Path, PathBuf};
@@ -16,11 +17,12 @@ pub enum MeshFileError {
 }
 
 impl Mesh {
-    /// A mesh, or a cloud of points as a mesh without triangles. Polygons are cut into triangles from their first corner.
+    /// A mesh, or a cloud of points as a mesh without triangles. Polygons are cut into triangles from their first
+    /// corner.
     ///
     /// # Errors
-    /// If the file cannot be read, is no PLY in text or little endian binary, has no vertices with finite `x`, `y`, `z`,
-    /// or faces with corners it lacks.
+    /// If the file cannot be read, is no PLY in text or little endian binary, has no vertices with finite `x`, `y`,
+    /// `z`, or faces with corners it lacks.
     pub fn read_ply(path: &Path) -> Result<Mesh, MeshFileError> {
         let bytes = std::fs::read(path).map_err(|source| MeshFileError::Read { path: path.into(), source })?;
         parse(&bytes).map_err(|problem| MeshFileError::Format { path: path.into(), problem })

@@ -204,7 +204,8 @@ mod tests {
             assert_eq!(serde_json::to_value(metric).unwrap(), metric.key());
         }
         let all: Scores = serde_json::from_str(
-            r#"{"rotation_error_deg": 1, "translation_error_x100": 2, "psnr_db": 3, "ssim": 4, "lpips": 5, "depth_error": 6}"#,
+            r#"{"rotation_error_deg": 1, "translation_error_x100": 2, "psnr_db": 3,
+                "ssim": 4, "lpips": 5, "depth_error": 6}"#,
         )
         .unwrap();
         let values: Vec<f64> = Metric::ALL.iter().filter_map(|m| all.get(*m)).collect();
