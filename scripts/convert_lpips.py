@@ -3,7 +3,8 @@
 
 usage: convert_lpips.py TRUNK.pth LPIPS.pth OUT.safetensors
 
-TRUNK.pth  torchvision's AlexNet, as its model zoo ships it (alexnet-owt-7be5be79.pth): features.N.weight, features.N.bias
+TRUNK.pth  torchvision's AlexNet, as its model zoo ships it (alexnet-owt-7be5be79.pth):
+           features.N.weight, features.N.bias
 LPIPS.pth  the linear layers of LPIPS 0.1 on AlexNet, in the package lpips: lpips/weights/v0.1/alex.pth
            (linN.model.1.weight)
 

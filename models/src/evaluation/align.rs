@@ -90,9 +90,9 @@ pub struct Similarity {
     pub rotation: Matrix3<f64>,
     /// In reference units.
     pub translation: Vector3<f64>,
-    /// Largest over second largest singular value of the centres' correlation. Near one the rotation is well determined;
-    /// infinite where centres lie on one line or in one point, so that they say nothing about the turn around it.
-    /// One where the rotation is a camera's and not the centres' ([`pairwise`]).
+    /// Largest over second largest singular value of the centres' correlation. Near one the rotation is well
+    /// determined; infinite where centres lie on one line or in one point, so that they say nothing about the turn
+    /// around it. One where the rotation is a camera's and not the centres' ([`pairwise`]).
     pub condition: f64,
 }
 

@@ -1,8 +1,8 @@
 //! The Chamfer distance between a mesh and a reference surface.
 //!
-//! Points are drawn evenly over each surface. Accuracy is the mean distance from the mesh to the nearest reference point,
-//! completeness the mean the other way round; the Chamfer distance is the mean of the two. Distances above a limit are
-//! left out, as DTU's evaluation does with its 20 mm.
+//! Points are drawn evenly over each surface. Accuracy is the mean distance from the mesh to the nearest reference
+//! point, completeness the mean the other way round; the Chamfer distance is the mean of the two. Distances above a
+//! limit are left out, as DTU's evaluation does with its 20 mm.
 
 use super::mesh::{Mesh, MeshError};
 use crate::data::Random;

@@ -1,8 +1,8 @@
 //! Poses for other programs: `transforms.json` (NeRF, instant-ngp, nerfstudio), COLMAP text, LLFF `poses_bounds.npy`.
 //!
 //! The poses are written in the frame and scale they come in: give poses aligned to the reference
-//! ([`Similarity::align`](super::Similarity::align)) or those of the learned frame. A loader that recentres or flips the
-//! world (LLFF's does) has to be undone by the caller first.
+//! ([`Similarity::align`](super::Similarity::align)) or those of the learned frame. A loader that recentres or flips
+//! the world (LLFF's does) has to be undone by the caller first.
 
 use super::align::{PoseSetError, check_poses};
 use crate::geometry::Pose;
@@ -15,7 +15,7 @@ use std::path::Path;
 
 /// One camera as it is written out.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Camera {
+pub struct ExportCamera {
     /// The picture's file name, as other programs look for it.
     pub name: String,
     pub width: usize,
@@ -41,7 +41,7 @@ pub enum ExportError {
     Write(#[from] WriteError),
 }
 
-fn check(cameras: &[Camera]) -> Result<(), ExportError> {
+fn check(cameras: &[ExportCamera]) -> Result<(), ExportError> {
     let poses: Vec<Pose> = cameras.iter().map(|c| c.pose).collect();
     check_poses("exported", &poses)?;
     for (view, c) in cameras.iter().enumerate() {
@@ -61,14 +61,14 @@ fn flip() -> Matrix3<f64> {
     Matrix3::new(1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, -1.0)
 }
 
-/// `transforms.json`: camera to world with OpenGL's camera axes, focal lengths and principal point per frame, and those of
-/// the first frame for the whole, with `camera_angle_x = 2 atan(w / (2 fl_x))`.
+/// `transforms.json`: camera to world with OpenGL's camera axes, focal lengths and principal point per frame, and those
+/// of the first frame for the whole, with `camera_angle_x = 2 atan(w / (2 fl_x))`.
 ///
 /// # Errors
 /// If a camera is none.
-pub fn transforms_json(cameras: &[Camera]) -> Result<String, ExportError> {
+pub fn transforms_json(cameras: &[ExportCamera]) -> Result<String, ExportError> {
     check(cameras)?;
-    let lens = |c: &Camera| {
+    let lens = |c: &ExportCamera| {
         let [fx, fy] = c.focal;
         json!({
             "camera_angle_x": 2.0 * (c.width as f64 / (2.0 * fx)).atan(),
@@ -76,7 +76,7 @@ pub fn transforms_json(cameras: &[Camera]) -> Result<String, ExportError> {
             "fl_x": fx, "fl_y": fy, "cx": c.principal[0], "cy": c.principal[1], "w": c.width, "h": c.height,
         })
     };
-    let frame = |c: &Camera| {
+    let frame = |c: &ExportCamera| {
         let world = c.pose.inverse();
         let axes = world.rotation * flip();
         let row = |i: usize| json!([axes[(i, 0)], axes[(i, 1)], axes[(i, 2)], world.translation[i]]);
@@ -91,8 +91,8 @@ pub fn transforms_json(cameras: &[Camera]) -> Result<String, ExportError> {
     Ok(serde_json::to_string_pretty(&all).unwrap_or_default())
 }
 
-/// The three files of a COLMAP text model. Poses are world to camera, as here; cameras are `PINHOLE`, one for all pictures
-/// that share size and lens. There are no points: `points3D.txt` has a head only.
+/// The three files of a COLMAP text model. Poses are world to camera, as here; cameras are `PINHOLE`, one for all
+/// pictures that share size and lens. There are no points: `points3D.txt` has a head only.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Colmap {
     pub cameras: String,
@@ -103,9 +103,9 @@ pub struct Colmap {
 impl Colmap {
     /// # Errors
     /// If a camera is none, or its name has a line break, which the format cannot hold.
-    pub fn new(cameras: &[Camera]) -> Result<Colmap, ExportError> {
+    pub fn new(cameras: &[ExportCamera]) -> Result<Colmap, ExportError> {
         check(cameras)?;
-        let mut lenses: Vec<&Camera> = vec![];
+        let mut lenses: Vec<&ExportCamera> = vec![];
         let mut out = Colmap {
             cameras: "# Camera list: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n".into(),
             images: "# Image list, two lines each: IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; POINTS2D[]\n"
@@ -117,8 +117,9 @@ impl Colmap {
                 let problem = "COLMAP's text format has no line breaks in names".to_string();
                 return Err(ExportError::Camera { view, name: c.name.clone(), problem });
             }
-            let same =
-                |o: &&Camera| (o.width, o.height, o.focal, o.principal) == (c.width, c.height, c.focal, c.principal);
+            let same = |o: &&ExportCamera| {
+                (o.width, o.height, o.focal, o.principal) == (c.width, c.height, c.focal, c.principal)
+            };
             let lens = lenses.iter().position(same).unwrap_or_else(|| {
                 lenses.push(c);
                 lenses.len() - 1
@@ -161,13 +162,13 @@ impl Colmap {
 /// Share of a pixel that focal lengths or centres may differ by where a format has one number for both.
 const LENS: f64 = 1e-3;
 
-/// LLFF's `poses_bounds.npy`: per picture 17 doubles, the 3 x 5 matrix `[down, right, back, centre, (height, width, focal)]`
-/// row by row, then the nearest and farthest depth.
+/// LLFF's `poses_bounds.npy`: per picture 17 doubles, the 3 x 5 matrix of the columns down, right, back, centre and
+/// (height, width, focal) row by row, then the nearest and farthest depth.
 ///
 /// # Errors
-/// If a camera is none, has no bounds, two focal lengths, or a principal point off the middle of the picture: the format
-/// has no place for those.
-pub fn poses_bounds(cameras: &[Camera]) -> Result<Vec<u8>, ExportError> {
+/// If a camera is none, has no bounds, two focal lengths, or a principal point off the middle of the picture: the
+/// format has no place for those.
+pub fn poses_bounds(cameras: &[ExportCamera]) -> Result<Vec<u8>, ExportError> {
     check(cameras)?;
     let mut numbers: Vec<f64> = Vec::with_capacity(17 * cameras.len());
     for (view, c) in cameras.iter().enumerate() {
@@ -208,8 +209,8 @@ mod tests {
     use super::*;
     use nalgebra::{Quaternion, Vector3};
 
-    fn cameras() -> Vec<Camera> {
-        let camera = |i: usize| Camera {
+    fn cameras() -> Vec<ExportCamera> {
+        let camera = |i: usize| ExportCamera {
             name: format!("images/IMG {i}.JPG"),
             width: 640,
             height: 480,
@@ -288,7 +289,7 @@ mod tests {
 
     #[test]
     fn cameras_that_do_not_fit_a_format_are_refused() {
-        let with = |change: fn(&mut Camera)| {
+        let with = |change: fn(&mut ExportCamera)| {
             let mut cameras = cameras();
             change(&mut cameras[1]);
             cameras

@@ -1,10 +1,10 @@
 //! A surface of constant density as triangles: marching cubes (Lorensen and Cline 1987).
 //!
-//! Densities are taken at the corners of a grid of cubes. Where an edge of a cube has one end above the threshold and one
-//! below, the surface cuts it, at the point where linear interpolation meets the threshold. How the cuts of one cube join
-//! up follows from its faces alone: on each face a line goes from the cut where its outline enters the dense side to the
-//! next, so that two cubes that share a face agree and the surface has no holes. The table of all 256 cases is made from
-//! that rule, see [`Table`].
+//! Densities are taken at the corners of a grid of cubes. Where an edge of a cube has one end above the threshold and
+//! one below, the surface cuts it, at the point where linear interpolation meets the threshold. How the cuts of one
+//! cube join up follows from its faces alone: on each face a line goes from the cut where its outline enters the dense
+//! side to the next, so that two cubes that share a face agree and the surface has no holes. The table of all 256 cases
+//! is made from that rule, see [`Table`].
 
 use std::collections::HashMap;
 
@@ -102,12 +102,12 @@ impl MeshOptions {
 }
 
 impl Mesh {
-    /// The surface where the density crosses the threshold. `density` gets points in world units, at most 16384 at a time,
-    /// and gives one density each. The surface ends where the bounds cut through what is dense.
+    /// The surface where the density crosses the threshold. `density` gets points in world units, at most 16384 at a
+    /// time, and gives one density each. The surface ends where the bounds cut through what is dense.
     ///
     /// # Errors
-    /// If the options make no grid, `density` fails or gives something that is no density, or the whole grid lies on one
-    /// side of the threshold.
+    /// If the options make no grid, `density` fails or gives something that is no density, or the whole grid lies on
+    /// one side of the threshold.
     pub fn extract(
         options: &MeshOptions,
         mut density: impl FnMut(&[[f64; 3]]) -> Result<Vec<f32>, DensityError>,

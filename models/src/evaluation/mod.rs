@@ -5,6 +5,7 @@
 //! Of the same quantity the published programs compute more than one version; each function says whose it is.
 
 mod align;
+mod camera_plot;
 mod chamfer;
 mod depth_pictures;
 mod export;
@@ -12,17 +13,26 @@ mod image_metrics;
 mod lpips;
 mod mesh;
 mod mesh_files;
+mod mesh_reader;
 mod novel_path;
 mod pose_error;
+mod published;
+mod scores;
+mod table;
 mod video;
 
 pub use align::{Alignment, PoseSetError, Similarity, pairwise, procrustes, umeyama};
+pub use camera_plot::{CameraLayout, CameraPanel, CameraPlotError, camera_plot};
 pub use chamfer::{Chamfer, CloudError, chamfer};
 pub use depth_pictures::{DepthStyle, inverse_depth};
-pub use export::{Camera, Colmap, ExportError, poses_bounds, transforms_json};
+pub use export::{Colmap, ExportCamera, ExportError, poses_bounds, transforms_json};
 pub use image_metrics::{DepthErrors, ImageError, Picture, depth_errors, mse, psnr, released_depth_errors, ssim};
 pub use lpips::{Lpips, WeightsError};
 pub use mesh::{DensityError, Mesh, MeshError, MeshOptions};
+pub use mesh_reader::MeshFileError;
 pub use novel_path::{FRAMES, anchor, novel_view_path};
 pub use pose_error::{PoseErrors, pose_errors, rotation_angle};
+pub use published::{PublishedRow, PublishedTable, published, published_of};
+pub use scores::{Evaluation, Measured, Metric, Scores, Stage, ViewScores};
+pub use table::{Row, Table};
 pub use video::{Video, VideoError, write_video, write_video_with};

@@ -1,7 +1,7 @@
 //! The path of the novel-view videos: a small circle about a training camera.
 //!
-//! `theta_i = 2 pi i / n`; `R = R_y(asin(0.05 cos theta)) R_x(asin(0.05 sin theta))`; the pose is the anchor after a shift
-//! of (0, 0, 3.8 s), the turn R, and a shift of (0, 0, -4 s): the camera swings about a point four units ahead.
+//! `theta_i = 2 pi i / n`; `R = R_y(asin(0.05 cos theta)) R_x(asin(0.05 sin theta))`; the pose is the anchor after a
+//! shift of (0, 0, 3.8 s), the turn R, and a shift of (0, 0, -4 s): the camera swings about a point four units ahead.
 
 use super::align::{PoseSetError, check_poses};
 use crate::geometry::Pose;

@@ -1,9 +1,9 @@
 //! Errors of camera poses, after alignment.
 //!
-//! Rotation: `acos(clamp((tr(R R_ref^T) - 1) / 2))`, the argument kept 1e-7 from either end as the published programs do,
-//! so no error below 0.0256 degrees is ever reported. Translation: the distance of the world-to-camera vectors, which
-//! holds the rotation error times the camera's distance as well, and the distance of camera centres beside it. Lengths
-//! are in units of the reference; papers print them times 100.
+//! Rotation: `acos(clamp((tr(R R_ref^T) - 1) / 2))`, the argument kept 1e-7 from either end as the published programs
+//! do, so no error below 0.0256 degrees is ever reported. Translation: the distance of the world-to-camera vectors,
+//! which holds the rotation error times the camera's distance as well, and the distance of camera centres beside it.
+//! Lengths are in units of the reference; papers print them times 100.
 
 use super::align::{PoseSetError, check_pairs};
 use crate::geometry::Pose;

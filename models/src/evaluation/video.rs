@@ -19,7 +19,10 @@ pub enum VideoError {
     Empty,
     #[error("a video needs a frame rate of 1 to 1000 a second, not {0}")]
     Rate(u32),
-    #[error("frame {frame} has {} x {} pixels (width x height), the first has {} x {}", .found[0], .found[1], .first[0], .first[1])]
+    #[error(
+        "frame {frame} has {} x {} pixels (width x height), the first has {} x {}",
+        .found[0], .found[1], .first[0], .first[1]
+    )]
     Size { frame: usize, first: [usize; 2], found: [usize; 2] },
     #[error("{program} failed ({status}): {message}")]
     Encoder { program: String, status: String, message: String },

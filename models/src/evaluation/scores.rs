@@ -1,0 +1,216 @@
+//! What was measured of one run: per view and on average, before and after test-time refinement.
+
+use serde::{Deserialize, Serialize};
+
+/// A quantity the papers report.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Metric {
+    RotationErrorDeg,
+    /// In units of the data set, times 100.
+    #[serde(rename = "translation_error_x100")]
+    TranslationErrorX100,
+    PsnrDb,
+    Ssim,
+    Lpips,
+    /// Mean absolute, in units of the data set.
+    DepthError,
+}
+
+impl Metric {
+    pub const ALL: [Metric; 6] = [
+        Metric::RotationErrorDeg,
+        Metric::TranslationErrorX100,
+        Metric::PsnrDb,
+        Metric::Ssim,
+        Metric::Lpips,
+        Metric::DepthError,
+    ];
+
+    /// Its name in files.
+    pub fn key(self) -> &'static str {
+        match self {
+            Metric::RotationErrorDeg => "rotation_error_deg",
+            Metric::TranslationErrorX100 => "translation_error_x100",
+            Metric::PsnrDb => "psnr_db",
+            Metric::Ssim => "ssim",
+            Metric::Lpips => "lpips",
+            Metric::DepthError => "depth_error",
+        }
+    }
+
+    /// Its name for people, with its unit.
+    pub fn heading(self) -> &'static str {
+        match self {
+            Metric::RotationErrorDeg => "rotation (deg)",
+            Metric::TranslationErrorX100 => "translation (x 100)",
+            Metric::PsnrDb => "PSNR (dB)",
+            Metric::Ssim => "SSIM",
+            Metric::Lpips => "LPIPS",
+            Metric::DepthError => "depth error",
+        }
+    }
+
+    /// Digits after the point.
+    pub fn decimals(self) -> usize {
+        match self {
+            Metric::PsnrDb => 2,
+            _ => 3,
+        }
+    }
+
+    /// Whether a smaller number is a better one.
+    pub fn lower_is_better(self) -> bool {
+        !matches!(self, Metric::PsnrDb | Metric::Ssim)
+    }
+
+    /// Whether it is of the training cameras, and so the same before and after refinement of test poses.
+    pub fn is_of_poses(self) -> bool {
+        matches!(self, Metric::RotationErrorDeg | Metric::TranslationErrorX100)
+    }
+}
+
+/// Values of the metrics, as far as they were taken. Infinite ones, as the PSNR of equal pictures, become null in JSON.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Scores {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rotation_error_deg: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub translation_error_x100: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub psnr_db: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub ssim: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lpips: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub depth_error: Option<f64>,
+}
+
+impl Scores {
+    pub fn get(&self, metric: Metric) -> Option<f64> {
+        match metric {
+            Metric::RotationErrorDeg => self.rotation_error_deg,
+            Metric::TranslationErrorX100 => self.translation_error_x100,
+            Metric::PsnrDb => self.psnr_db,
+            Metric::Ssim => self.ssim,
+            Metric::Lpips => self.lpips,
+            Metric::DepthError => self.depth_error,
+        }
+    }
+
+    /// The mean of each metric over those that have it.
+    pub fn mean<'a>(all: impl IntoIterator<Item = &'a Scores> + Clone) -> Scores {
+        let of = |metric: Metric| {
+            let values: Vec<f64> = all.clone().into_iter().filter_map(|s| s.get(metric)).collect();
+            (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+        };
+        Scores {
+            rotation_error_deg: of(Metric::RotationErrorDeg),
+            translation_error_x100: of(Metric::TranslationErrorX100),
+            psnr_db: of(Metric::PsnrDb),
+            ssim: of(Metric::Ssim),
+            lpips: of(Metric::Lpips),
+            depth_error: of(Metric::DepthError),
+        }
+    }
+}
+
+/// Scores of one view.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ViewScores {
+    /// Name of the view's picture.
+    pub view: String,
+    #[serde(flatten)]
+    pub scores: Scores,
+}
+
+/// Scores of views and their mean.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Measured {
+    pub mean: Scores,
+    pub views: Vec<ViewScores>,
+}
+
+impl Measured {
+    pub fn new(views: Vec<ViewScores>) -> Measured {
+        Measured { mean: Scores::mean(views.iter().map(|v| &v.scores)), views }
+    }
+}
+
+/// When pictures were scored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Stage {
+    /// Test poses as the alignment gives them.
+    Before,
+    /// Test poses refined on their pictures with the field frozen.
+    After,
+}
+
+impl Stage {
+    pub fn name(self) -> &'static str {
+        match self {
+            Stage::Before => "before",
+            Stage::After => "after",
+        }
+    }
+}
+
+/// One run, measured.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Evaluation {
+    pub scene: String,
+    pub method: String,
+    /// Pose errors of the training cameras; empty where there is no reference to compare with.
+    pub cameras: Measured,
+    /// Test views at the poses the alignment gives.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub before: Option<Measured>,
+    /// Test views after test-time refinement.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub after: Option<Measured>,
+}
+
+impl Evaluation {
+    /// The views of a stage.
+    pub fn stage(&self, stage: Stage) -> Option<&Measured> {
+        match stage {
+            Stage::Before => self.before.as_ref(),
+            Stage::After => self.after.as_ref(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn means_are_over_what_was_measured() {
+        let view = |view: &str, psnr_db, lpips| ViewScores {
+            view: view.into(),
+            scores: Scores { psnr_db: Some(psnr_db), lpips, ..Scores::default() },
+        };
+        let measured = Measured::new(vec![view("a", 20.0, None), view("b", 30.0, Some(0.5))]);
+        assert_eq!(measured.mean, Scores { psnr_db: Some(25.0), lpips: Some(0.5), ..Scores::default() });
+        assert_eq!(Measured::new(vec![]).mean, Scores::default());
+    }
+
+    #[test]
+    fn names_in_files_are_those_of_the_fields() {
+        for metric in Metric::ALL {
+            assert_eq!(serde_json::to_value(metric).unwrap(), metric.key());
+        }
+        let all: Scores = serde_json::from_str(
+            r#"{"rotation_error_deg": 1, "translation_error_x100": 2, "psnr_db": 3,
+                "ssim": 4, "lpips": 5, "depth_error": 6}"#,
+        )
+        .unwrap();
+        let values: Vec<f64> = Metric::ALL.iter().filter_map(|m| all.get(*m)).collect();
+        assert_eq!(values, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
+        let json = serde_json::to_value(all).unwrap();
+        assert!(Metric::ALL.iter().all(|m| json.get(m.key()).is_some()));
+    }
+}
