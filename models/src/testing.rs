@@ -11,7 +11,8 @@ use raygrad_compiler::autodiff::{grad, zeros_like};
 use raygrad_compiler::functions::mlp::Init;
 use raygrad_compiler::graph::topological;
 use raygrad_compiler::ops::input::Input;
-use raygrad_compiler::reference::{Array, Bindings, Direction, EvalError, central_difference, evaluate};
+use raygrad_compiler::reference::{Array, Bindings, Data, Direction, EvalError, central_difference, evaluate};
+use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Axis, Program, Shape, Step, StepError, Target, Tensor, compile};
 use raygrad_runtime::{Device, DeviceError, RunError, Session};
 
@@ -39,6 +40,8 @@ pub enum TestError {
 
 const FRAMES: usize = 3;
 const POINTS: usize = 7;
+/// The step number, for warps that change while training goes on.
+const STEP: u32 = 3;
 /// Steps of the central differences, and what may be lost to them, relative to the derivative.
 const STEPS: [f64; 3] = [1e-4, 1e-5, 1e-6];
 const TOLERANCE: f64 = 1e-5;
@@ -56,7 +59,8 @@ struct Bench {
 
 impl Bench {
     fn new(warp: &dyn Warp) -> Result<Bench, TestError> {
-        let (frame, point) = (Axis::new("frame", FRAMES), Axis::new("point", POINTS));
+        let frame = warp.frame().cloned().unwrap_or_else(|| Axis::new("frame", FRAMES));
+        let point = Axis::new("point", POINTS);
         let xy = Tensor::parameter("points", Shape::new(&[&frame, &point], 2));
         let planar = Points::planar(frame.clone(), point.clone(), xy.clone());
         let (at, expected) = if warp.dof() == Dof::Pose {
@@ -80,10 +84,16 @@ impl Bench {
         if let Some(residual) = &found.residual {
             scalar = scalar + residual;
         }
+        if let Some((penalty, weight)) = &found.penalty {
+            scalar = scalar + penalty * *weight;
+        }
         for t in topological([scalar.clone()]) {
             let Some(Input { name, shape, .. }) = t.op_as::<Input>() else { continue };
-            let values = (0..shape.lanes()).map(|_| 0.5 * random.normal()).collect();
-            bindings.insert(name.clone(), Array::floats(shape, values));
+            let array = match shape.dtype {
+                DType::F32 => Array::floats(shape, (0..shape.lanes()).map(|_| 0.5 * random.normal()).collect()),
+                DType::U32 => Array::integers(shape, vec![STEP; shape.lanes()]),
+            };
+            bindings.insert(name.clone(), array);
         }
         let parameters: Vec<_> = code.into_iter().chain(warp.parameters()).collect();
         for p in &parameters {
@@ -91,6 +101,8 @@ impl Bench {
                 Init::Zero => 0.1,
                 Init::Uniform(bound) => bound,
                 Init::Normal(deviation) => 0.3 * deviation,
+                Init::NormalRows { deviation, .. } => deviation,
+                Init::ColumnNorms { .. } => 1.0,
             };
             let values = (0..p.tensor.shape().lanes()).map(|_| spread * (2.0 * random.uniform() - 1.0)).collect();
             bindings
@@ -174,7 +186,10 @@ pub fn check_gradients(warp: &dyn Warp) -> Result<(), TestError> {
         let program = session.add(compile(&step, &device.target())?)?;
         for (input, value) in &bench.bindings {
             if session.inputs().any(|(known, _)| known == input) {
-                session.set(input, &value.f().iter().map(|v| *v as f32).collect::<Vec<_>>())?;
+                match &value.data {
+                    Data::F(v) => session.set(input, &v.iter().map(|v| *v as f32).collect::<Vec<_>>())?,
+                    Data::U(v) => session.set_u32(input, v)?,
+                }
             }
         }
         session.run(program)?;

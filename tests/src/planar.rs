@@ -107,6 +107,8 @@ impl Planar {
             Init::Zero => 0.15,
             Init::Uniform(bound) => bound,
             Init::Normal(deviation) => deviation,
+            Init::NormalRows { deviation, .. } => deviation,
+            Init::ColumnNorms { .. } => 1.0,
         };
         (0..lanes).map(|_| rng.uniform(-bound, bound)).collect()
     }
@@ -167,7 +169,7 @@ pub struct Trajectory {
 
 /// Names of the losses a training step gives.
 pub fn losses(step: &Step) -> Vec<String> {
-    let known = ["render", "alignment", "total"];
+    let known = ["render", "alignment", "penalty", "total"];
     step.outputs.iter().map(|(n, _)| n.clone()).filter(|n| known.contains(&&**n)).collect()
 }
 

@@ -51,14 +51,14 @@ pub struct PlanarModel {
 
 impl PlanarModel {
     pub fn new(settings: &Settings, grid: Grid, warp: Arc<dyn Warp>) -> PlanarModel {
-        let frame = Axis::new("frame", settings.data.patches);
+        let frame = warp.frame().cloned().unwrap_or_else(|| Axis::new("frame", settings.data.patches));
         let pixel = Axis::new("pixel", grid.crop_pixels());
         let code = warps::codes(&*warp, &frame);
         let field = NeuralImage::new(&settings.field);
         PlanarModel { settings: settings.clone(), grid, warp, field, frame, pixel, code }
     }
 
-    /// Everything that is trained.
+    /// Everything that a checkpoint holds; not all of it need be trained.
     pub fn parameters(&self) -> Vec<Parameter> {
         self.field.parameters().into_iter().chain(self.warp_parameters()).collect()
     }
@@ -80,7 +80,7 @@ impl PlanarModel {
     }
 
     /// One training step: outputs `render`, `total`, `transform` and, where the warp has
-    /// one, `alignment`; and an update of every parameter.
+    /// one, `alignment` and `penalty`; and an update of every trained parameter.
     #[track_caller]
     pub fn train_step(&self) -> Step {
         let (at, target) = match self.settings.data.points_per_patch {
@@ -128,9 +128,13 @@ impl PlanarModel {
     #[track_caller]
     fn total(&self, found: &Registration, render: &Tensor) -> Tensor {
         let weight = self.settings.loss.alignment;
-        match &found.residual {
+        let aligned = match &found.residual {
             Some(residual) if weight > 0.0 => render + residual * weight,
             _ => render.clone(),
+        };
+        match &found.penalty {
+            Some((penalty, weight)) if *weight > 0.0 => aligned + penalty * *weight,
+            _ => aligned,
         }
     }
 
@@ -174,8 +178,9 @@ impl PlanarModel {
         let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
         let scalars = |lr| StepScalars { lr: scalar(lr), bias1: scalar(BIAS1), bias2: scalar(BIAS2) };
         let (of_field, of_warp) = (scalars(LR_FIELD), scalars(LR_WARP));
-        let all: Vec<(Tensor, &StepScalars)> = (self.field.parameters().into_iter().map(|p| (p.tensor, &of_field)))
-            .chain(self.warp_parameters().map(|p| (p.tensor, &of_warp)))
+        let all: Vec<(Tensor, &StepScalars)> = (self.field.parameters().into_iter().map(|p| (p, &of_field)))
+            .chain(self.warp_parameters().map(|p| (p, &of_warp)))
+            .filter_map(|(p, scalars)| p.trained.then_some((p.tensor, scalars)))
             .collect();
         let gradients = grad(total, &all.iter().map(|(p, _)| p).collect::<Vec<_>>());
         let mut updates = vec![];
@@ -206,6 +211,7 @@ fn progress() -> Tensor {
 fn losses_and_transform(found: &Registration, render: Tensor, total: &Tensor) -> Vec<(String, Tensor)> {
     let mut outputs = vec![("render", render), ("total", total.clone()), ("transform", found.transform.clone())];
     outputs.extend(found.residual.clone().map(|r| ("alignment", r)));
+    outputs.extend(found.penalty.clone().map(|(p, _)| ("penalty", p)));
     outputs.into_iter().map(|(name, t)| (name.to_string(), t)).collect()
 }
 

@@ -5,13 +5,12 @@ use super::model::{self, PlanarModel};
 use super::rates::{Rates, STEP};
 use crate::Error;
 use crate::config::Settings;
-use crate::data::Random;
+use crate::data::initial_values;
 use crate::geometry::Transform;
 use crate::pictures::View;
 use crate::run::checkpoint::{Checkpoint, Saved};
 use crate::run::metrics::{CornerError, Entry};
 use crate::warps::{KNOWN_TRUTH, Warp};
-use raygrad_compiler::functions::mlp::Init;
 use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::{Channels, Program, Shape, compile};
 use raygrad_runtime::{Device, InputInfo, ProgramId, Session};
@@ -180,7 +179,7 @@ impl Trainer {
 
     fn read_entry(&mut self, program: ProgramId) -> Result<(Entry, Vec<Transform>), Error> {
         let mut loss = BTreeMap::new();
-        for name in ["render", "alignment", "total"] {
+        for name in ["render", "alignment", "penalty", "total"] {
             if self.session.program(program).outputs.iter().any(|(n, _)| n == name) {
                 let value = f64::from(self.session.read(program, name)?[0]);
                 self.check_finite(name, &[value])?;
@@ -244,14 +243,7 @@ impl Trainer {
     fn fill_parameters(&mut self, model: &PlanarModel) -> Result<(), Error> {
         for p in model.parameters() {
             let Some(name) = p.tensor.input_name().filter(|n| self.inputs.contains_key(*n)) else { continue };
-            let mut random = Random::new(self.settings.run.seed, name);
-            let mut draw = || match p.init {
-                Init::Zero => 0.0,
-                Init::Uniform(bound) => bound * (2.0 * random.uniform() - 1.0),
-                Init::Normal(deviation) => deviation * random.normal(),
-            };
-            let values: Vec<f32> = (0..p.tensor.shape().lanes()).map(|_| draw() as f32).collect();
-            self.session.set(name, &values)?;
+            self.session.set(name, &initial_values(&p, self.settings.run.seed))?;
         }
         Ok(())
     }

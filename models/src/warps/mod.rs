@@ -6,16 +6,21 @@
 
 mod fit;
 mod global;
+pub mod invertible;
 mod known;
 mod local;
+mod plain;
 
 pub use fit::fit_global;
 use fit::move_by;
 pub use global::GlobalWarp;
+pub use invertible::InvertibleWarp;
 pub use known::{KnownWarp, TRUTH as KNOWN_TRUTH};
 pub use local::LocalWarp;
+pub use plain::{ImplicitMlpWarp, MlpWarp, Se3Field};
 
 use crate::config::{Dof, Method, Settings, Solver};
+use raygrad_compiler::functions::matrix::identity;
 use raygrad_compiler::functions::mlp::{Init, Parameter};
 use raygrad_compiler::{Axes, Axis, Shape, Tensor};
 use std::fmt::Debug;
@@ -60,7 +65,7 @@ pub trait Warp: Debug + Send + Sync {
     /// Field points of all `at.position`, as many channels. `code` has [`Warp::code_width`] channels a frame.
     fn map(&self, at: &Points, code: &Tensor) -> Tensor;
 
-    /// Channels of the trained code of a frame; 0 for none.
+    /// Channels of the code of a frame that the optimiser may move; 0 for none.
     fn code_width(&self) -> usize {
         0
     }
@@ -70,9 +75,24 @@ pub trait Warp: Debug + Send + Sync {
         Init::Normal(1.0)
     }
 
+    /// Whether the codes move, or stay as they started.
+    fn code_trained(&self) -> bool {
+        true
+    }
+
     /// What the warp trains besides the codes.
     fn parameters(&self) -> Vec<Parameter> {
         vec![]
+    }
+
+    /// The axis of the frames, where parameters of the warp lie along it.
+    fn frame(&self) -> Option<&Axis> {
+        None
+    }
+
+    /// A term that the warp adds to the loss, given the field points of its map, and the term's weight.
+    fn penalty(&self, _at: &Points, _code: &Tensor, _mapped: &Tensor) -> Option<(Tensor, f64)> {
+        None
     }
 
     /// The transform of each frame (see [`Registration::transform`]), where the map is nothing but that. By default it is
@@ -101,10 +121,16 @@ pub trait Warp: Debug + Send + Sync {
 /// The warp that settings ask for.
 pub fn of_settings(settings: &Settings) -> Arc<dyn Warp> {
     let warp = &settings.warp;
+    let frame = || Axis::new("frame", settings.data.patches);
     match warp.method {
         Method::None => Arc::new(KnownWarp),
         Method::Global => Arc::new(GlobalWarp { dof: warp.dof }),
         Method::Local => Arc::new(LocalWarp::new(warp)),
+        Method::Invertible => Arc::new(InvertibleWarp::new(warp, None)),
+        Method::MultiInvertible => Arc::new(InvertibleWarp::new(warp, Some(frame()))),
+        Method::Mlp => Arc::new(MlpWarp::new(warp)),
+        Method::ImplicitMlp => Arc::new(ImplicitMlpWarp::new(warp, settings.loss.cycle)),
+        Method::Se3Field => Arc::new(Se3Field::new(warp)),
     }
 }
 
@@ -120,6 +146,8 @@ pub struct Registration {
     pub global: Tensor,
     /// Mean of (local - global)^2 over frames, points and coordinates; none where the map is the global transform.
     pub residual: Option<Tensor>,
+    /// A term of the warp's own and its weight, see [`Warp::penalty`].
+    pub penalty: Option<(Tensor, f64)>,
 }
 
 impl Registration {
@@ -130,23 +158,36 @@ impl Registration {
         let held = pinned && !warp.zero_code_is_identity();
         let mapped = warp.map(at, code);
         let local = if held { first.select(&at.position, &mapped) } else { mapped };
+        let penalty = warp.penalty(at, code, &local);
         match warp.global(&at.frame, code) {
-            Some(transform) => Registration { global: local.clone(), local, transform, residual: None },
+            Some(transform) => {
+                let transform = if held { first.select(&neutral(warp.dof()), &transform) } else { transform };
+                Registration { global: local.clone(), local, transform, residual: None, penalty }
+            }
             None => {
                 let transform = fit_global(warp.dof(), warp.solver(), at, &local, held.then_some(&first));
                 let global = move_by(warp.dof(), &transform, &at.position);
                 let residual = Some(fit::residual(warp.dof(), &transform, &at.position, &local, &global));
-                Registration { local, transform, global, residual }
+                Registration { local, transform, global, residual, penalty }
             }
         }
     }
 }
 
-/// The trained codes of a warp, if it has any.
+/// The transform that moves nothing.
+#[track_caller]
+fn neutral(dof: Dof) -> Tensor {
+    match dof {
+        Dof::Pose => Tensor::constant_matrix(3, 4, &[1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1., 0.]),
+        _ => identity(3),
+    }
+}
+
+/// The codes of a warp's frames, if it has any.
 pub fn codes(warp: &dyn Warp, frame: &Axis) -> Option<Parameter> {
     let width = warp.code_width();
-    (width > 0).then(|| Parameter {
-        tensor: Tensor::parameter("warp.code", Shape::new(&[frame], width)),
-        init: warp.code_init(),
+    (width > 0).then(|| {
+        let shape = Shape::new(&[frame], width);
+        Parameter::new("warp.code", shape, warp.code_init()).trained(warp.code_trained())
     })
 }
