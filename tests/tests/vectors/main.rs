@@ -2,6 +2,7 @@
 //! Set `RAYGRAD_DATA` to the folder that holds `vectors`; without it the tests only say that they were skipped.
 
 mod fits;
+mod inn;
 mod networks;
 mod planar;
 mod primitives;
