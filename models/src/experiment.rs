@@ -130,7 +130,7 @@ impl Experiment {
         self.layered.validate()?;
         let settings = &self.layered.settings;
         let data = PlanarData::load(&self.layered)?;
-        let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings));
+        let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings, settings.data.patches));
         Trainer::new(settings, data, warp, self.open()?)
     }
 
@@ -139,7 +139,7 @@ impl Experiment {
         self.layered.validate()?;
         let settings = &self.layered.settings;
         let data = SpaceData::load(&self.layered, &|_, _| {})?;
-        let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings));
+        let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings, data.scene.train.len()));
         Explorer::new(settings, data, warp, self.open()?)
     }
 

@@ -11,7 +11,8 @@ use raygrad_compiler::autodiff::{grad, zeros_like};
 use raygrad_compiler::functions::mlp::Init;
 use raygrad_compiler::graph::topological;
 use raygrad_compiler::ops::input::Input;
-use raygrad_compiler::reference::{Array, Bindings, Direction, EvalError, central_difference, evaluate};
+use raygrad_compiler::reference::{Array, Bindings, Data, Direction, EvalError, central_difference, evaluate};
+use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Axis, Program, Shape, Step, StepError, Target, Tensor, compile};
 use raygrad_runtime::{Device, DeviceError, RunError, Session};
 
@@ -39,6 +40,8 @@ pub enum TestError {
 
 const FRAMES: usize = 3;
 const POINTS: usize = 7;
+/// The step number, for warps that change while training goes on.
+const STEP: u32 = 3;
 /// Steps of the central differences, and what may be lost to them, relative to the derivative.
 const STEPS: [f64; 3] = [1e-4, 1e-5, 1e-6];
 const TOLERANCE: f64 = 1e-5;
@@ -56,7 +59,8 @@ struct Bench {
 
 impl Bench {
     fn new(warp: &dyn Warp) -> Result<Bench, TestError> {
-        let (frame, point) = (Axis::new("frame", FRAMES), Axis::new("point", POINTS));
+        let frame = warp.frame().cloned().unwrap_or_else(|| Axis::new("frame", FRAMES));
+        let point = Axis::new("point", POINTS);
         let xy = Tensor::parameter("points", Shape::new(&[&frame, &point], 2));
         let planar = Points::planar(frame.clone(), point.clone(), xy.clone());
         let (at, expected) = if warp.dof() == Dof::Pose {
@@ -85,10 +89,16 @@ impl Bench {
         if let Some(centers) = &found.centers {
             scalar = scalar + centers.sin().sum_channels().sum_over(centers.axes());
         }
+        if let Some((penalty, weight)) = &found.penalty {
+            scalar = scalar + penalty * *weight;
+        }
         for t in topological([scalar.clone()]) {
             let Some(Input { name, shape, .. }) = t.op_as::<Input>() else { continue };
-            let values = (0..shape.lanes()).map(|_| 0.5 * random.normal()).collect();
-            bindings.insert(name.clone(), Array::floats(shape, values));
+            let array = match shape.dtype {
+                DType::F32 => Array::floats(shape, (0..shape.lanes()).map(|_| 0.5 * random.normal()).collect()),
+                DType::U32 => Array::integers(shape, vec![STEP; shape.lanes()]),
+            };
+            bindings.insert(name.clone(), array);
         }
         let parameters: Vec<_> = code.into_iter().chain(warp.parameters()).collect();
         for p in &parameters {
@@ -96,6 +106,8 @@ impl Bench {
                 Init::Zero => 0.1,
                 Init::Uniform(bound) => bound,
                 Init::Normal(deviation) => 0.3 * deviation,
+                Init::NormalRows { deviation, .. } => deviation,
+                Init::ColumnNorms { .. } => 1.0,
             };
             let values = (0..p.tensor.shape().lanes()).map(|_| spread * (2.0 * random.uniform() - 1.0)).collect();
             bindings
@@ -114,44 +126,37 @@ impl Bench {
         Ok(Bench { scalar, local: found.local, inputs, bindings })
     }
 
-    /// Derivative of `scalar` along `direction` of one input, as a graph.
-    fn along(&self, scalar: &Tensor, input: &Tensor, direction: &[f64]) -> Tensor {
-        let name = format!("direction.{}", input.input_name().unwrap_or_default());
-        debug_assert_eq!(input.shape().lanes(), direction.len());
-        let pulled = grad(scalar, &[input]).remove(0);
-        (pulled * Tensor::data(name, input.shape().clone()))
-            .reshape(input.width())
-            .sum_channels()
-            .sum_over(input.axes())
-    }
-
+    /// Compares the derivatives of `scalar` along a random direction of each input with central differences. The sum of
+    /// these derivatives, as a graph, with its directions in the bindings: what the next order differentiates.
     fn check(
         &self,
         order: &'static str,
         scalar: &Tensor,
-        bindings: &Bindings,
+        bindings: &mut Bindings,
         random: &mut Random,
-    ) -> Result<(), TestError> {
-        for input in &self.inputs {
-            let name = input.input_name().unwrap_or_default();
+    ) -> Result<Tensor, TestError> {
+        let gradients = grad(scalar, &self.inputs.iter().collect::<Vec<_>>());
+        let (mut slopes, mut directions) = (vec![], vec![]);
+        for (input, gradient) in self.inputs.iter().zip(gradients) {
+            let name = format!("{order} direction.{}", input.input_name().unwrap_or_default());
             let direction: Vec<f64> = (0..input.shape().lanes()).map(|_| random.normal()).collect();
-            let mut bindings = bindings.clone();
-            // The second order differentiates along the first one's direction again.
-            bindings.insert(format!("direction.{name}"), Array::floats(input.shape(), direction.clone()));
-            let slope = self.along(scalar, input, &direction);
-            let found = evaluate(std::slice::from_ref(&slope), &bindings)?[0].f()[0];
-            let differences = |step| central_difference(scalar, &bindings, name, &Direction::Along(&direction), step);
+            bindings.insert(name.clone(), Array::floats(input.shape(), direction.clone()));
+            let along = gradient * Tensor::data(name, input.shape().clone());
+            slopes.push(along.reshape(input.width()).sum_channels().sum_over(input.axes()));
+            directions.push(direction);
+        }
+        let found = evaluate(&slopes, bindings)?;
+        for ((input, direction), found) in self.inputs.iter().zip(&directions).zip(found) {
+            let (name, found) = (input.input_name().unwrap_or_default(), found.f()[0]);
+            let differences = |step| central_difference(scalar, bindings, name, &Direction::Along(direction), step);
             let agrees = |expected: f64| (found - expected).abs() <= TOLERANCE * (1.0 + expected.abs());
             // A difference across a kink (of a rectifier) is no derivative: a shorter one does not reach it.
             let expected = differences(STEPS[0])?;
             if !agrees(expected) && !agrees(differences(STEPS[1])?) && !agrees(differences(STEPS[2])?) {
                 return Err(TestError::Gradient { order, input: name.to_string(), found, expected });
             }
-            if order == "first" {
-                self.check("second", &slope, &bindings, random)?;
-            }
         }
-        Ok(())
+        Ok(slopes.into_iter().reduce(|a, b| a + b).unwrap_or_else(|| Tensor::scalar(0.0)))
     }
 
     /// Values and gradients as one step.
@@ -171,7 +176,9 @@ impl Bench {
 /// Checks the derivatives of a warp, first and second order, and its values and gradients on every device there is.
 pub fn check_gradients(warp: &dyn Warp) -> Result<(), TestError> {
     let bench = Bench::new(warp)?;
-    bench.check("first", &bench.scalar, &bench.bindings, &mut Random::new(1, "testing"))?;
+    let (mut bindings, mut random) = (bench.bindings.clone(), Random::new(1, "testing"));
+    let slope = bench.check("first", &bench.scalar, &mut bindings, &mut random)?;
+    bench.check("second", &slope, &mut bindings, &mut random)?;
     let step = bench.step();
     let expected = evaluate(&step.roots(), &bench.bindings)?;
     for (name, device) in devices()? {
@@ -179,7 +186,10 @@ pub fn check_gradients(warp: &dyn Warp) -> Result<(), TestError> {
         let program = session.add(compile(&step, &device.target())?)?;
         for (input, value) in &bench.bindings {
             if session.inputs().any(|(known, _)| known == input) {
-                session.set(input, &value.f().iter().map(|v| *v as f32).collect::<Vec<_>>())?;
+                match &value.data {
+                    Data::F(v) => session.set(input, &v.iter().map(|v| *v as f32).collect::<Vec<_>>())?,
+                    Data::U(v) => session.set_u32(input, v)?,
+                }
             }
         }
         session.run(program)?;

@@ -145,7 +145,7 @@ fn check(case: &Value) {
         (0..targets.len() * 3).map(|k| targets[k / (3 * pixels) * pixels + k % pixels][k / pixels % 3]).collect();
     close(&format!("{name}: patches"), &patches, &numbers(&output["patches"]), tolerance("patches"));
 
-    let model = PlanarModel::new(&settings, grid, warps::of_settings(&settings));
+    let model = PlanarModel::new(&settings, grid, warps::of_settings(&settings, settings.data.patches));
     let step = model.train_step();
     let barf = input["model"] == "planar";
     let mut bound = Bindings::new();

@@ -1,8 +1,9 @@
 //! Derivatives of every built-in warp, first and second order, in the reference and on the devices.
 
-use raygrad::config::{Dof, Layered};
+use raygrad::config::{Dof, Layered, WarpSettings};
 use raygrad::testing::check_gradients;
-use raygrad::warps::{GlobalWarp, LocalWarp};
+use raygrad::warps::{GlobalWarp, ImplicitMlpWarp, InvertibleWarp, LocalWarp, MlpWarp, Se3Field, Warp};
+use raygrad_compiler::Axis;
 
 const ALL: [Dof; 5] = [Dof::Rotation, Dof::Translation, Dof::Rigid, Dof::Pose, Dof::Homography];
 
@@ -13,15 +14,63 @@ fn global_warps() {
     }
 }
 
+/// Settings of small networks.
+fn small(dof: Dof, set: &[&str]) -> WarpSettings {
+    let mut layered = Layered::load("planar-inn").unwrap();
+    let sizes = ["warp.code=4", "warp.layers=[8,8,8]", "warp.skip=[2]", "warp.bands=2", "warp.solver=eigen"];
+    for text in sizes.iter().chain(&["warp.inn.blocks=2", "warp.inn.hidden=5", "warp.inn.anneal_steps=10"]).chain(set) {
+        layered.set(text).unwrap_or_else(|e| panic!("{e}"));
+    }
+    layered.settings.warp.dof = dof;
+    layered.settings.warp
+}
+
+fn check(what: &str, warp: &dyn Warp) {
+    check_gradients(warp).unwrap_or_else(|e| panic!("{what}: {e}"));
+}
+
 #[test]
 fn local_warps() {
     // The local group differs from the global one only for the last.
     for dof in [Dof::Rigid, Dof::Pose, Dof::Homography] {
-        let mut layered = Layered::load("planar-l2g").unwrap();
-        for set in ["warp.code=4", "warp.layers=[8,8,8]", "warp.skip=[2]", "warp.solver=eigen"] {
-            layered.set(set).unwrap();
-        }
-        layered.settings.warp.dof = dof;
-        check_gradients(&LocalWarp::new(&layered.settings.warp)).unwrap_or_else(|e| panic!("{dof}: {e}"));
+        check(&dof.to_string(), &LocalWarp::new(&small(dof, &["warp.activation=relu"])));
     }
+}
+
+#[test]
+fn invertible_warps_in_space() {
+    let variants: [&[&str]; 6] = [
+        &[],
+        &["warp.inn.anneal=channels", "warp.inn.blocks=4"],
+        &["warp.inn.anneal=point-slots"],
+        &["warp.inn.code=posenc", "warp.activation=silu"],
+        &["warp.inn.code=extrinsic", "warp.activation=sine"],
+        &["warp.code=0", "warp.activation=gaussian"],
+    ];
+    for set in variants {
+        check(&format!("{set:?}"), &InvertibleWarp::new(&small(Dof::Pose, set), None));
+    }
+    check("one a frame", &InvertibleWarp::new(&small(Dof::Pose, &[]), Some(Axis::new("frame", 2))));
+}
+
+#[test]
+fn invertible_warps_in_the_plane() {
+    for lift in ["warp.inn.lift=homogeneous", "warp.inn.lift=plane"] {
+        for dof in [Dof::Rigid, Dof::Homography] {
+            check(&format!("{dof}, {lift}"), &InvertibleWarp::new(&small(dof, &[lift]), None));
+        }
+        let slots = small(Dof::Homography, &[lift, "warp.inn.anneal=point-slots", "warp.activation=elu"]);
+        check(lift, &InvertibleWarp::new(&slots, None));
+        let frame = Some(Axis::new("frame", 2));
+        check(lift, &InvertibleWarp::new(&small(Dof::Homography, &[lift]), frame));
+    }
+}
+
+#[test]
+fn plain_networks() {
+    for dof in [Dof::Pose, Dof::Homography] {
+        check(&dof.to_string(), &MlpWarp::new(&small(dof, &["warp.activation=relu"])));
+        check(&dof.to_string(), &ImplicitMlpWarp::new(&small(dof, &["warp.activation=silu"]), 0.3));
+    }
+    check("pose network", &Se3Field::new(&small(Dof::Pose, &["warp.activation=gaussian"])));
 }

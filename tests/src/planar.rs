@@ -44,7 +44,7 @@ impl Planar {
         let settings = layered.settings;
         let [rows, columns] = settings.data.patch_crop;
         let grid = Grid { height: 2 * rows, width: 2 * columns, crop: [rows, columns] };
-        let model = PlanarModel::new(&settings, grid, warps::of_settings(&settings));
+        let model = PlanarModel::new(&settings, grid, warps::of_settings(&settings, settings.data.patches));
         let name = set.iter().fold(preset.to_string(), |name, s| format!("{name} {s}"));
         let mut planar = Planar { name, model, bindings: Bindings::new() };
         planar.fill();
@@ -55,7 +55,7 @@ impl Planar {
     pub fn recorded(preset: &str) -> PlanarModel {
         let settings = Layered::load(preset).unwrap_or_else(|e| panic!("{e}")).settings;
         let grid = Grid { height: 360, width: 480, crop: settings.data.patch_crop };
-        PlanarModel::new(&settings, grid, warps::of_settings(&settings))
+        PlanarModel::new(&settings, grid, warps::of_settings(&settings, settings.data.patches))
     }
 
     fn fill(&mut self) {
@@ -108,6 +108,8 @@ impl Planar {
             Init::Zero => 0.15,
             Init::Uniform(bound) => bound,
             Init::Normal(deviation) => deviation,
+            Init::NormalRows { deviation, .. } => deviation,
+            Init::ColumnNorms { .. } => 1.0,
         };
         (0..lanes).map(|_| rng.uniform(-bound, bound)).collect()
     }
@@ -168,7 +170,7 @@ pub struct Trajectory {
 
 /// Names of the losses a training step gives.
 pub fn losses(step: &Step) -> Vec<String> {
-    let known = ["render", "alignment", "total"];
+    let known = ["render", "alignment", "penalty", "total"];
     step.outputs.iter().map(|(n, _)| n.clone()).filter(|n| known.contains(&&**n)).collect()
 }
 

@@ -14,6 +14,12 @@ pub enum Activation {
     Softplus(f64),
     /// With its sigma.
     Gaussian(f64),
+    /// `x sigmoid(x)`.
+    Silu,
+    /// `x` above 0, `e^x - 1` below.
+    Elu,
+    /// `sin(omega x)`, with its omega.
+    Sine(f64),
 }
 
 impl Activation {
@@ -26,18 +32,36 @@ impl Activation {
             Activation::Tanh => x.tanh(),
             Activation::Softplus(beta) => x.softplus(beta),
             Activation::Gaussian(sigma) => x.gaussian(sigma),
+            Activation::Silu => x * x.sigmoid(),
+            Activation::Elu => {
+                let zero = Tensor::scalar(0.0);
+                // The minimum keeps the exponential, and with it the gradient not taken, finite.
+                x.greater_than(&zero).select(x, &(x.min(&zero).exp() - 1.0))
+            }
+            Activation::Sine(omega) => (x * omega).sin(),
         }
     }
 }
 
 /// How a host fills a parameter before training.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub enum Init {
     Zero,
     /// Uniform in `-bound..bound`.
     Uniform(f64),
     /// Normal with mean 0 and this deviation.
     Normal(f64),
+    /// Of a weight matrix, the first rows normal with mean 0 and this deviation, the others zero.
+    NormalRows {
+        rows: usize,
+        deviation: f64,
+    },
+    /// Norms of the columns of another parameter, which has its name, so many rows, and initial values of its own.
+    ColumnNorms {
+        of: String,
+        rows: usize,
+        init: Box<Init>,
+    },
 }
 
 impl Init {
@@ -49,13 +73,37 @@ impl Init {
     pub fn glorot(gain: f64, fan_in: usize, fan_out: usize) -> Init {
         Init::Uniform(gain * (6.0 / (fan_in + fan_out) as f64).sqrt())
     }
+    /// The same values times `factor`.
+    pub fn scaled(self, factor: f64) -> Init {
+        match self {
+            Init::Zero => Init::Zero,
+            Init::Uniform(bound) => Init::Uniform(bound * factor),
+            Init::Normal(deviation) => Init::Normal(deviation * factor),
+            Init::NormalRows { rows, deviation } => Init::NormalRows { rows, deviation: deviation * factor },
+            Init::ColumnNorms { of, rows, init } => Init::ColumnNorms { of, rows, init: Box::new(init.scaled(factor)) },
+        }
+    }
 }
 
-/// A trained tensor and its initial values.
+/// A tensor that a step may update, and its initial values.
 #[derive(Clone, Debug)]
 pub struct Parameter {
     pub tensor: Tensor,
     pub init: Init,
+    /// Whether the optimiser moves it; else it stays as it started.
+    pub trained: bool,
+}
+
+impl Parameter {
+    /// The trained parameter called `name`.
+    #[track_caller]
+    pub fn new(name: impl Into<String>, shape: Shape, init: Init) -> Parameter {
+        Parameter { tensor: Tensor::parameter(name, shape), init, trained: true }
+    }
+    /// The same parameter, trained only if `trained`.
+    pub fn trained(self, trained: bool) -> Parameter {
+        Parameter { trained, ..self }
+    }
 }
 
 /// Shape of a network.
@@ -123,8 +171,8 @@ impl Mlp {
             let weight = shape(crate::graph::Channels::Matrix(fan_in, pair[1]));
             let bias = shape(crate::graph::Channels::Vector(pair[1]));
             let name = |what: &str| format!("{}.{layer}.{what}", spec.prefix);
-            parameters.push(Parameter { tensor: Tensor::parameter(name("weight"), weight), init });
-            parameters.push(Parameter { tensor: Tensor::parameter(name("bias"), bias), init });
+            parameters.push(Parameter::new(name("weight"), weight, init.clone()));
+            parameters.push(Parameter::new(name("bias"), bias, init));
         }
         Mlp { spec, parameters }
     }
@@ -164,11 +212,7 @@ impl Mlp {
     /// the raw channels are open at first, and `sqrt(inputs / raw inputs)` restores the scale of the hidden ones.
     pub fn scale_first_layer(mut self, factor: f64) -> Mlp {
         for p in self.parameters.iter_mut().take(2) {
-            p.init = match p.init {
-                Init::Zero => Init::Zero,
-                Init::Uniform(bound) => Init::Uniform(bound * factor),
-                Init::Normal(deviation) => Init::Normal(deviation * factor),
-            };
+            p.init = p.init.clone().scaled(factor);
         }
         self
     }

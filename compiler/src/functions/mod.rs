@@ -6,6 +6,7 @@
 //! | [`lie`] | exponentials of rotations, rigid motions and homographies |
 //! | [`posenc`] | positional encoding and its coarse-to-fine weights |
 //! | [`mlp`] | multi-layer perceptrons |
+//! | [`weight_norm`] | a layer with lengths and directions of its weights apart |
 //! | [`rigid_fit`] | closed-form rotation, translation and rigid motion between point sets |
 //! | [`homography`] | direct linear transform |
 //! | [`image`] | bilinear lookup |
@@ -21,6 +22,7 @@ pub mod matrix;
 pub mod mlp;
 pub mod posenc;
 pub mod rigid_fit;
+pub mod weight_norm;
 
 use crate::graph::Tensor;
 

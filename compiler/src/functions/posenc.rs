@@ -21,20 +21,48 @@ pub fn encoded_width(n: usize, bands: usize) -> usize {
 /// run of channels, not a node each.
 #[track_caller]
 pub fn positional_encoding(x: &Tensor, bands: usize, weights: Option<&Tensor>) -> Tensor {
+    // Channel 2 L i + j is wave j of dimension i: a sine for j < L, a cosine after that.
+    let place = |c: usize| Wave { source: c / (2 * bands), band: c % bands, cosine: c / bands % 2 == 1 };
+    encode("positional_encoding", x, bands, weights, place)
+}
+
+/// The same waves in another order: for each frequency the sines of all channels of `x`, then their cosines.
+#[track_caller]
+pub fn frequency_encoding(x: &Tensor, bands: usize, weights: Option<&Tensor>) -> Tensor {
+    let n = x.width();
+    let place = |c: usize| Wave { source: c % n, band: c / (2 * n), cosine: c / n % 2 == 1 };
+    encode("frequency_encoding", x, bands, weights, place)
+}
+
+/// What one channel of an encoding holds.
+struct Wave {
+    /// Channel of the operand.
+    source: usize,
+    band: usize,
+    cosine: bool,
+}
+
+#[track_caller]
+fn encode(
+    name: &'static str,
+    x: &Tensor,
+    bands: usize,
+    weights: Option<&Tensor>,
+    place: impl Fn(usize) -> Wave,
+) -> Tensor {
     if bands == 0 {
         return x.clone();
     }
-    // Channel 2 L i + j is wave j of dimension i: a sine for j < L, a cosine after that.
-    let waves = x.width() * 2 * bands;
-    let source: Vec<usize> = (0..waves).map(|c| c / (2 * bands)).collect();
-    let band: Vec<usize> = (0..waves).map(|c| c % bands).collect();
+    let waves: Vec<Wave> = (0..x.width() * 2 * bands).map(place).collect();
+    let source: Vec<usize> = waves.iter().map(|w| w.source).collect();
+    let band: Vec<usize> = waves.iter().map(|w| w.band).collect();
     let scale: Vec<f64> = band.iter().map(|k| 2f64.powi(*k as i32 - 1)).collect();
-    let quarter: Vec<f64> = (0..waves).map(|c| if (c / bands).is_multiple_of(2) { 0.0 } else { 0.25 }).collect();
+    let quarter: Vec<f64> = waves.iter().map(|w| if w.cosine { 0.25 } else { 0.0 }).collect();
     let h = x.pick(&source) * Tensor::constant(&scale) + Tensor::constant(&quarter);
     let t = &h - (&h + 0.5).floor();
     let mut wave = (t * TAU).sin();
     if let Some(w) = weights {
-        if let Err(bad) = super::expect_width("positional_encoding", "band weights", w, bands) {
+        if let Err(bad) = super::expect_width(name, "band weights", w, bands) {
             return bad;
         }
         wave = wave * w.stop_gradient().pick(&band);

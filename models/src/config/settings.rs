@@ -1,5 +1,6 @@
 //! The settings of an experiment. Field docs are in `presets/planar-l2g.toml`, which sets every one of them.
 
+use raygrad_compiler::functions::mlp::Activation;
 use serde::{Deserialize, Deserializer, Serialize, Serializer, de};
 use std::fmt;
 use std::str::FromStr;
@@ -134,12 +135,32 @@ pub struct WarpSettings {
     pub code: usize,
     pub layers: Vec<usize>,
     pub skip: Vec<usize>,
+    pub bands: usize,
+    pub activation: ActivationKind,
     pub solver: Solver,
+    pub inn: InnSettings,
+}
+
+/// The invertible networks ("invertible", "multi-invertible").
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct InnSettings {
+    pub blocks: usize,
+    pub hidden: usize,
+    pub lift: Lift,
+    pub code: CodeKind,
+    pub anneal: Anneal,
+    pub anneal_steps: usize,
+    pub train_network: bool,
+    pub train_code: bool,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FieldSettings {
+    pub kind: FieldKind,
+    pub sigma: f64,
+    pub omega: f64,
     pub layers: Vec<usize>,
     pub bands: usize,
     pub encoding: Encoding,
@@ -150,6 +171,7 @@ pub struct FieldSettings {
 #[serde(deny_unknown_fields)]
 pub struct Loss {
     pub alignment: f64,
+    pub cycle: f64,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -181,11 +203,79 @@ pub enum NoiseKind {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "kebab-case")]
 pub enum Method {
     None,
     Global,
     Local,
+    Invertible,
+    MultiInvertible,
+    Mlp,
+    ImplicitMlp,
+    Se3Field,
+}
+
+/// What follows the hidden layers of a warp's network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ActivationKind {
+    Relu,
+    Softplus,
+    Silu,
+    Elu,
+    Sine,
+    Gaussian,
+}
+
+impl ActivationKind {
+    /// With the constants of the invertible warp's paper.
+    pub fn of_warps(self) -> Activation {
+        match self {
+            ActivationKind::Relu => Activation::Relu,
+            ActivationKind::Softplus => Activation::Softplus(100.0),
+            ActivationKind::Silu => Activation::Silu,
+            ActivationKind::Elu => Activation::Elu,
+            ActivationKind::Sine => Activation::Sine(10.0),
+            ActivationKind::Gaussian => Activation::Gaussian(1.0),
+        }
+    }
+}
+
+/// How an invertible network maps the plane.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Lift {
+    /// It maps (x, y, 1), and the third coordinate divides.
+    Homogeneous,
+    /// It maps (x, y).
+    Plane,
+}
+
+/// What a frame's code is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum CodeKind {
+    Free,
+    Posenc,
+    Extrinsic,
+}
+
+/// How the frequencies of an invertible network open.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Anneal {
+    None,
+    Channels,
+    PointSlots,
+}
+
+/// What a neural image is made of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum FieldKind {
+    Relu,
+    Gaussian,
+    Siren,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

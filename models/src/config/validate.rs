@@ -2,11 +2,12 @@
 
 use super::error::ConfigError;
 use super::layers::Layered;
-use super::settings::{Count, DepthSettings, Dof, Encoding, ImageSize, Method, NoiseKind};
+use super::settings::{Anneal, CodeKind, Count, DepthSettings, Dof, Encoding, FieldKind, ImageSize, Method, NoiseKind};
 
 /// Widest layer and most bands a configuration may ask for: more is a typing error, not an experiment.
 const MAX_WIDTH: usize = 4096;
 const MAX_BANDS: usize = 20;
+const MAX_BLOCKS: usize = 64;
 const MAX_SIDE: usize = 16384;
 /// Most samples of a ray.
 const MAX_SAMPLES: usize = 1024;
@@ -15,10 +16,14 @@ impl Layered {
     /// Checks every value that needs no other file.
     pub fn validate(&self) -> Result<(), ConfigError> {
         match &self.settings.scene {
-            None => self.data()?,
+            None => {
+                self.data()?;
+                self.plane()?;
+            }
             Some(_) => self.space()?,
         }
         self.networks()?;
+        self.invertible()?;
         self.numbers()?;
         self.loss()
     }
@@ -26,9 +31,6 @@ impl Layered {
     fn data(&self) -> Result<(), ConfigError> {
         let d = &self.settings.data;
         self.at_least("data.patches", d.patches, 1)?;
-        if self.settings.warp.dof == Dof::Pose {
-            return Err(self.refuse("warp.dof", "patches of a picture have 1, 2, 3 or 8 degrees of freedom, found 6"));
-        }
         if self.settings.noise.kind == NoiseKind::Barf && d.patches > 5 {
             let text = format!("the noise kind \"barf\" has shifts for at most 5 patches, found {}", d.patches);
             return Err(self.refuse("data.patches", text));
@@ -119,6 +121,21 @@ impl Layered {
         Ok(())
     }
 
+    /// What registers cameras does not register patches of a picture.
+    fn plane(&self) -> Result<(), ConfigError> {
+        let warp = &self.settings.warp;
+        if warp.dof == Dof::Pose {
+            let text = "expected 1 (rotation), 2 (translation), 3 (rigid) or 8 (homography) for patches of a picture, \
+                        found 6 (pose)";
+            return Err(self.refuse("warp.dof", text));
+        }
+        if warp.method == Method::Se3Field {
+            let text = "\"se3-field\" moves cameras in space; patches of a picture have \"global\", for example";
+            return Err(self.refuse("warp.method", text));
+        }
+        Ok(())
+    }
+
     fn networks(&self) -> Result<(), ConfigError> {
         let (warp, field) = (&self.settings.warp, &self.settings.field);
         for (key, layers) in [("warp.layers", &warp.layers), ("field.layers", &field.layers)] {
@@ -132,8 +149,19 @@ impl Layered {
                 format!("layer {bad} cannot skip: expected 1 to {}, the layers after the first", warp.layers.len());
             return Err(self.refuse("warp.skip", text));
         }
-        if warp.method == Method::Local && (warp.code == 0 || warp.code > MAX_WIDTH) {
+        let coded = [Method::Local, Method::Mlp, Method::ImplicitMlp, Method::Se3Field].contains(&warp.method);
+        if (coded && warp.code == 0) || warp.code > MAX_WIDTH {
             return Err(self.refuse("warp.code", format!("expected 1 to {MAX_WIDTH} channels, found {}", warp.code)));
+        }
+        if warp.bands > MAX_BANDS {
+            return Err(self.refuse("warp.bands", format!("expected 0 to {MAX_BANDS} bands, found {}", warp.bands)));
+        }
+        for (kind, key, value) in
+            [(FieldKind::Gaussian, "field.sigma", field.sigma), (FieldKind::Siren, "field.omega", field.omega)]
+        {
+            if field.kind == kind && !(value > 0.0 && value.is_finite()) {
+                return Err(self.refuse(key, format!("expected a number above 0, found {value}")));
+            }
         }
         if field.encoding != Encoding::None && (field.bands == 0 || field.bands > MAX_BANDS) {
             return Err(self.refuse("field.bands", format!("expected 1 to {MAX_BANDS} bands, found {}", field.bands)));
@@ -142,6 +170,35 @@ impl Layered {
         if !(0.0 <= start && start < end && end <= 1.0) {
             let text = format!("expected [start, end] with 0 <= start < end <= 1, found [{start}, {end}]");
             return Err(self.refuse("field.window", text));
+        }
+        Ok(())
+    }
+
+    fn invertible(&self) -> Result<(), ConfigError> {
+        let (warp, inn) = (&self.settings.warp, &self.settings.warp.inn);
+        if !matches!(warp.method, Method::Invertible | Method::MultiInvertible) {
+            return Ok(());
+        }
+        for (key, value, most) in [("blocks", inn.blocks, MAX_BLOCKS), ("hidden", inn.hidden, MAX_WIDTH)] {
+            if value == 0 || value > most {
+                return Err(self.refuse(&format!("warp.inn.{key}"), format!("expected 1 to {most}, found {value}")));
+            }
+        }
+        if inn.anneal != Anneal::None {
+            self.at_least("warp.inn.anneal_steps", inn.anneal_steps, 1)?;
+        }
+        let shared = warp.method == Method::Invertible;
+        if shared && inn.code == CodeKind::Posenc && (warp.code < 2 || warp.code % 2 == 1) {
+            let text = format!(
+                "the code \"posenc\" is pairs of sine and cosine: expected an even number, found {}",
+                warp.code
+            );
+            return Err(self.refuse("warp.code", text));
+        }
+        let code_moves = shared && inn.train_code && inn.code != CodeKind::Posenc && warp.code > 0;
+        if !inn.train_network && !code_moves {
+            let text = "nothing of the warp is trained: expected true, or codes that are";
+            return Err(self.refuse("warp.inn.train_network", text));
         }
         Ok(())
     }
@@ -177,11 +234,13 @@ impl Layered {
     }
 
     fn loss(&self) -> Result<(), ConfigError> {
-        let weight = self.settings.loss.alignment;
-        if weight >= 0.0 && weight.is_finite() {
-            return Ok(());
+        let loss = &self.settings.loss;
+        for (key, weight) in [("loss.alignment", loss.alignment), ("loss.cycle", loss.cycle)] {
+            if !(weight >= 0.0 && weight.is_finite()) {
+                return Err(self.refuse(key, format!("expected a weight of 0 or more, found {weight}")));
+            }
         }
-        Err(self.refuse("loss.alignment", format!("expected a weight of 0 or more, found {weight}")))
+        Ok(())
     }
 
     fn at_least(&self, key: &str, value: usize, least: usize) -> Result<(), ConfigError> {

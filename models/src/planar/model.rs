@@ -49,14 +49,14 @@ pub struct PlanarModel {
 
 impl PlanarModel {
     pub fn new(settings: &Settings, grid: Grid, warp: Arc<dyn Warp>) -> PlanarModel {
-        let frame = Axis::new("frame", settings.data.patches);
+        let frame = warp.frame().cloned().unwrap_or_else(|| Axis::new("frame", settings.data.patches));
         let pixel = Axis::new("pixel", grid.crop_pixels());
         let code = warps::codes(&*warp, &frame);
         let field = NeuralImage::new(&settings.field);
         PlanarModel { settings: settings.clone(), grid, warp, field, frame, pixel, code }
     }
 
-    /// Everything that is trained.
+    /// Everything that a checkpoint holds; not all of it need be trained.
     pub fn parameters(&self) -> Vec<Parameter> {
         self.field.parameters().into_iter().chain(self.warp_parameters()).collect()
     }
@@ -78,7 +78,7 @@ impl PlanarModel {
     }
 
     /// One training step: outputs `render`, `total`, `transform` and, where the warp has
-    /// one, `alignment`; and an update of every parameter.
+    /// one, `alignment` and `penalty`; and an update of every trained parameter.
     #[track_caller]
     pub fn train_step(&self) -> Step {
         let (at, target) = match self.settings.data.points_per_patch {
@@ -126,9 +126,13 @@ impl PlanarModel {
     #[track_caller]
     fn total(&self, found: &Registration, render: &Tensor) -> Tensor {
         let weight = self.settings.loss.alignment;
-        match &found.residual {
+        let aligned = match &found.residual {
             Some(residual) if weight > 0.0 => render + residual * weight,
             _ => render.clone(),
+        };
+        match &found.penalty {
+            Some((penalty, weight)) if *weight > 0.0 => aligned + penalty * *weight,
+            _ => aligned,
         }
     }
 
@@ -187,6 +191,7 @@ fn progress() -> Tensor {
 fn losses_and_transform(found: &Registration, render: Tensor, total: &Tensor) -> Vec<(String, Tensor)> {
     let mut outputs = vec![("render", render), ("total", total.clone()), ("transform", found.transform.clone())];
     outputs.extend(found.residual.clone().map(|r| ("alignment", r)));
+    outputs.extend(found.penalty.clone().map(|(p, _)| ("penalty", p)));
     outputs.into_iter().map(|(name, t)| (name.to_string(), t)).collect()
 }
 

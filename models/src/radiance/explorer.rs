@@ -63,7 +63,7 @@ impl Explorer {
         learner.fill(&model.parameters(), settings.run.seed)?;
         learner.set_seed(model::SEED, settings.run.seed)?;
         let flat = |rows: Vec<[f64; 12]>| rows.concat().iter().map(|x| *x as f32).collect::<Vec<f32>>();
-        learner.set(model::POSES, &flat(data.rough.iter().map(|p| p.to_rows()).collect()))?;
+        learner.set(model::POSES, &flat(data.start.poses.iter().map(|p| p.to_rows()).collect()))?;
         learner.set(model::FOUND, &nothing_found(views))?;
         let intrinsics: Vec<f32> = data.scene.train.iter().flat_map(|v| lens(&v.intrinsics)).collect();
         learner.set(model::INTRINSICS, &intrinsics)?;
@@ -237,7 +237,8 @@ impl Training for Explorer {
         if let Measured::Space { rotation_error_deg: Some(r), translation_error_x100: Some(t), .. } =
             last.entry.measured
         {
-            text += &format!("rotation error     {r:.3} deg (mean over {} training views)\n", self.data.rough.len());
+            text +=
+                &format!("rotation error     {r:.3} deg (mean over {} training views)\n", self.data.start.poses.len());
             text += &format!("translation error  {t:.3} x 0.01\n");
         }
         if let Some(s) = &self.scores {

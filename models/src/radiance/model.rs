@@ -91,7 +91,8 @@ impl RadianceModel {
         warp: Arc<dyn Warp>,
     ) -> Result<RadianceModel, NotInSpace> {
         let (scene, train, radiance) = sections(settings)?;
-        let (frame, pixel) = (Axis::new("frame", views), Axis::new("pixel", size.pixels()));
+        let frame = warp.frame().cloned().unwrap_or_else(|| Axis::new("frame", views));
+        let pixel = Axis::new("pixel", size.pixels());
         let code = warps::codes(&*warp, &frame);
         let field = RadianceField::new(&settings.field, radiance);
         let (settings, scene, train) = (settings.clone(), scene.clone(), train.clone());
@@ -119,8 +120,8 @@ impl RadianceModel {
         6.0 * rays * (self.train.samples as f64 * of(&self.field.parameters()) + of(&self.warp.parameters()))
     }
 
-    /// One training step: outputs `render`, `total`, `found` and, where the warp has one, `alignment`; and an update of every
-    /// parameter.
+    /// One training step: outputs `render`, `total`, `found` and, where the warp has one, `alignment` and `penalty`; and an
+    /// update of every trained parameter.
     #[track_caller]
     pub fn train_step(&self) -> Step {
         let ray = Axis::new("ray", self.rays_per_view());
@@ -152,13 +153,18 @@ impl RadianceModel {
         let images = Tensor::data(IMAGES, Shape::new(&[&self.frame, &self.pixel], 3));
         let render = mean_squared_error(&seen, &images.take(index, &self.pixel));
         let weight = self.settings.loss.alignment;
-        let total = match &found.residual {
+        let aligned = match &found.residual {
             Some(residual) if weight > 0.0 => &render + residual * weight,
             _ => render.clone(),
+        };
+        let total = match &found.penalty {
+            Some((penalty, weight)) if *weight > 0.0 => aligned + penalty * *weight,
+            _ => aligned,
         };
         let transform = found.transform.broadcast_to(&Axes::new([self.frame.clone()]));
         let mut outputs = vec![("render", render), ("total", total.clone()), ("found", transform.clone())];
         outputs.extend(found.residual.map(|r| ("alignment", r)));
+        outputs.extend(found.penalty.map(|(p, _)| ("penalty", p)));
         let outputs = outputs.into_iter().map(|(name, t)| (name.to_string(), t)).collect();
         let mut updates = updates(&total, &self.field.parameters(), &self.warp_parameters());
         if let (true, Some(code)) = (pinned && self.warp.zero_code_is_identity(), &self.code) {

@@ -41,9 +41,7 @@ pub struct Scores {
 
 /// What the run starts from, before it begins.
 pub fn write_data(folder: &RunFolder, data: &SpaceData) -> Result<(), Error> {
-    let views: Vec<_> = data.scene.train.iter().zip(&data.rough).map(|(v, p)| (v.name.clone(), p.to_rows())).collect();
-    let text = serde_json::to_string_pretty(&serde_json::json!({ "world_to_camera": views })).unwrap_or_default();
-    folder.write("initial_poses.json", text.as_bytes())?;
+    folder.write("initial_poses.json", data.start.to_json(Some(data.seed)).as_bytes())?;
     Ok(())
 }
 

@@ -115,13 +115,13 @@ impl Report<'_> {
             width,
             points: steps.iter().filter_map(|e| Some((e.step as f64, value(e)?))).collect(),
         };
-        let palette = [[0x1c, 0x1e, 0x21], [0x25, 0x63, 0xeb], [0xd9, 0x48, 0x0f]];
-        let terms = [("total", palette[0]), ("render", palette[1]), ("alignment", palette[2])];
+        let palette = [[0x1c, 0x1e, 0x21], [0x25, 0x63, 0xeb], [0xd9, 0x48, 0x0f], [0x2b, 0x8a, 0x3e]];
+        let terms = ["total", "render", "alignment", "penalty"].into_iter().zip(palette);
         // Without a second term the sum is the first.
         let summed = steps.iter().any(|e| e.loss.get("total") != e.loss.get("render"));
-        let losses: Vec<Curve> = (terms.iter())
+        let losses: Vec<Curve> = terms
             .filter(|(name, _)| summed || *name != "total")
-            .map(|(name, color)| curve(name, *color, 2, &|e| e.loss.get(*name).copied()))
+            .map(|(name, color)| curve(name, color, 2, &|e| e.loss.get(name).copied()))
             .filter(|c| !c.points.is_empty())
             .collect();
         let psnr = [curve("PSNR", palette[1], 2, &|e| Some(e.psnr_db()))];

@@ -3,9 +3,9 @@
 use super::optimise::{Rates, STEP};
 use crate::Error;
 use crate::config::Optim;
-use crate::data::Random;
+use crate::data::initial_values;
 use crate::run::checkpoint::{Checkpoint, Saved};
-use raygrad_compiler::functions::mlp::{Init, Parameter};
+use raygrad_compiler::functions::mlp::Parameter;
 use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::{Channels, Program, Shape, Step, compile};
 use raygrad_runtime::{Device, InputInfo, ProgramId, Session};
@@ -72,14 +72,7 @@ impl Learner {
     pub fn fill(&mut self, parameters: &[Parameter], seed: u32) -> Result<(), Error> {
         for p in parameters {
             let Some(name) = p.tensor.input_name().filter(|n| self.has(n)) else { continue };
-            let mut random = Random::new(seed, name);
-            let mut draw = || match p.init {
-                Init::Zero => 0.0,
-                Init::Uniform(bound) => bound * (2.0 * random.uniform() - 1.0),
-                Init::Normal(deviation) => deviation * random.normal(),
-            };
-            let values: Vec<f32> = (0..p.tensor.shape().lanes()).map(|_| draw() as f32).collect();
-            self.session.set(name, &values)?;
+            self.session.set(name, &initial_values(p, seed))?;
         }
         Ok(())
     }
@@ -113,7 +106,7 @@ impl Learner {
     /// The loss terms that a program has put out.
     pub fn losses(&mut self, program: ProgramId) -> Result<BTreeMap<String, f64>, Error> {
         let mut loss = BTreeMap::new();
-        for name in ["render", "alignment", "total"] {
+        for name in ["render", "alignment", "penalty", "total"] {
             if self.program(program).outputs.iter().any(|(n, _)| n == name) {
                 let value = f64::from(self.read(program, name)?[0]);
                 self.check_finite(name, &[value])?;

@@ -52,14 +52,16 @@ impl Rates {
     }
 }
 
-/// What an Adam step makes of every parameter and its moments; field and warp have learning rates of their own.
+/// What an Adam step makes of every trained parameter and its moments; field and warp have learning rates of their own.
 #[track_caller]
 pub fn updates(total: &Tensor, field: &[Parameter], warp: &[Parameter]) -> Vec<(Tensor, Tensor)> {
     let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
     let scalars = |lr| StepScalars { lr: scalar(lr), bias1: scalar(BIAS1), bias2: scalar(BIAS2) };
     let (of_field, of_warp) = (scalars(LR_FIELD), scalars(LR_WARP));
-    let all: Vec<(&Tensor, &StepScalars)> =
-        (field.iter().map(|p| (&p.tensor, &of_field))).chain(warp.iter().map(|p| (&p.tensor, &of_warp))).collect();
+    let all: Vec<(&Tensor, &StepScalars)> = (field.iter().map(|p| (p, &of_field)))
+        .chain(warp.iter().map(|p| (p, &of_warp)))
+        .filter_map(|(p, scalars)| p.trained.then_some((&p.tensor, scalars)))
+        .collect();
     let gradients = grad(total, &all.iter().map(|(p, _)| *p).collect::<Vec<_>>());
     let mut updates = vec![];
     for ((parameter, scalars), gradient) in all.into_iter().zip(&gradients) {

@@ -24,7 +24,8 @@ impl LocalWarp {
         let mut widths = vec![2 + settings.code];
         widths.extend(&settings.layers);
         widths.push(local_group(settings.dof).count());
-        let network = Mlp::new(MlpSpec::new("warp", &widths).skip(&settings.skip));
+        let network =
+            Mlp::new(MlpSpec::new("warp", &widths).skip(&settings.skip).hidden(settings.activation.of_warps()));
         LocalWarp { network, code: settings.code, global: settings.dof, solver: settings.solver }
     }
 }

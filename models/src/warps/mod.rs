@@ -6,16 +6,21 @@
 
 mod fit;
 mod global;
+pub mod invertible;
 mod known;
 mod local;
+mod plain;
 
 pub use fit::fit_global;
 use fit::move_by;
 pub use global::GlobalWarp;
+pub use invertible::InvertibleWarp;
 pub use known::{KnownWarp, TRUTH as KNOWN_TRUTH};
 pub use local::LocalWarp;
+pub use plain::{ImplicitMlpWarp, MlpWarp, Se3Field};
 
 use crate::config::{Dof, Method, Settings, Solver};
+use raygrad_compiler::functions::matrix::identity;
 use raygrad_compiler::functions::mlp::{Init, Parameter};
 use raygrad_compiler::{Axis, Shape, Tensor};
 use std::fmt::Debug;
@@ -56,7 +61,7 @@ pub trait Warp: Debug + Send + Sync {
     /// Field points of all `at.position`, as many channels. `code` has [`Warp::code_width`] channels a frame.
     fn map(&self, at: &Points, code: &Tensor) -> Tensor;
 
-    /// Channels of the trained code of a frame; 0 for none.
+    /// Channels of the code of a frame that the optimiser may move; 0 for none.
     fn code_width(&self) -> usize {
         0
     }
@@ -66,9 +71,24 @@ pub trait Warp: Debug + Send + Sync {
         Init::Normal(1.0)
     }
 
+    /// Whether the codes move, or stay as they started.
+    fn code_trained(&self) -> bool {
+        true
+    }
+
     /// What the warp trains besides the codes.
     fn parameters(&self) -> Vec<Parameter> {
         vec![]
+    }
+
+    /// The axis of the frames, where parameters of the warp lie along it.
+    fn frame(&self) -> Option<&Axis> {
+        None
+    }
+
+    /// A term that the warp adds to the loss, given the field points of its map, and the term's weight.
+    fn penalty(&self, _at: &Points, _code: &Tensor, _mapped: &Tensor) -> Option<(Tensor, f64)> {
+        None
     }
 
     /// The transform of each frame (see [`Registration::transform`]), where the map is nothing but that. By default it is
@@ -94,13 +114,19 @@ pub trait Warp: Debug + Send + Sync {
     }
 }
 
-/// The warp that settings ask for.
-pub fn of_settings(settings: &Settings) -> Arc<dyn Warp> {
+/// The warp that settings ask for, of so many frames.
+pub fn of_settings(settings: &Settings, frames: usize) -> Arc<dyn Warp> {
     let warp = &settings.warp;
+    let frame = || Axis::new("frame", frames);
     match warp.method {
         Method::None => Arc::new(KnownWarp { dof: warp.dof }),
         Method::Global => Arc::new(GlobalWarp { dof: warp.dof }),
         Method::Local => Arc::new(LocalWarp::new(warp)),
+        Method::Invertible => Arc::new(InvertibleWarp::new(warp, None)),
+        Method::MultiInvertible => Arc::new(InvertibleWarp::new(warp, Some(frame()))),
+        Method::Mlp => Arc::new(MlpWarp::new(warp)),
+        Method::ImplicitMlp => Arc::new(ImplicitMlpWarp::new(warp, settings.loss.cycle)),
+        Method::Se3Field => Arc::new(Se3Field::new(warp)),
     }
 }
 
@@ -119,6 +145,8 @@ pub struct Registration {
     /// Mean of (local - global)^2 over frames, points (in 3D pixels and centres) and coordinates; none where the map is the
     /// global transform.
     pub residual: Option<Tensor>,
+    /// A term of the warp's own and its weight, see [`Warp::penalty`].
+    pub penalty: Option<(Tensor, f64)>,
 }
 
 impl Registration {
@@ -133,9 +161,11 @@ impl Registration {
             if held { first.select(&at.position, &mapped) } else { mapped }
         };
         let (local, mapped_centers) = (map(at), centers.map(map));
+        let penalty = warp.penalty(at, code, &local);
         if let Some(transform) = warp.global(&at.frame, code) {
+            let transform = if held { first.select(&neutral(warp.dof()), &transform) } else { transform };
             let global = local.clone();
-            return Registration { local, transform, global, centers: mapped_centers, residual: None };
+            return Registration { local, transform, global, centers: mapped_centers, residual: None, penalty };
         }
         let mut pairs = vec![(at, &local)];
         pairs.extend(centers.zip(mapped_centers.as_ref()));
@@ -146,15 +176,24 @@ impl Registration {
             let global = move_by(warp.dof(), &transform, &at.position);
             residual = (residual + fit::residual(warp.dof(), &transform, at, local, &global)) * 0.5;
         }
-        Registration { local, transform, global, centers: mapped_centers, residual: Some(residual) }
+        Registration { local, transform, global, centers: mapped_centers, residual: Some(residual), penalty }
     }
 }
 
-/// The trained codes of a warp, if it has any.
+/// The transform that moves nothing.
+#[track_caller]
+fn neutral(dof: Dof) -> Tensor {
+    match dof {
+        Dof::Pose => Tensor::constant_matrix(3, 4, &[1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1., 0.]),
+        _ => identity(3),
+    }
+}
+
+/// The codes of a warp's frames, if it has any.
 pub fn codes(warp: &dyn Warp, frame: &Axis) -> Option<Parameter> {
     let width = warp.code_width();
-    (width > 0).then(|| Parameter {
-        tensor: Tensor::parameter("warp.code", Shape::new(&[frame], width)),
-        init: warp.code_init(),
+    (width > 0).then(|| {
+        let shape = Shape::new(&[frame], width);
+        Parameter::new("warp.code", shape, warp.code_init()).trained(warp.code_trained())
     })
 }

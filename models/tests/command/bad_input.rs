@@ -57,7 +57,12 @@ fn values_of_the_wrong_type_or_range() {
     std::fs::write(w.path("range.toml"), "base = \"planar-l2g\"\n[field]\n\nwindow = [0.5, 0.2]\n").unwrap();
     mentions(&w.refuse(&["train", "range.toml"]), &["range.toml:4", "field.window"]);
     for (args, expected) in [
-        (["--set", "warp.dof=4"], "expected 1 (rotation), 2 (translation), 3 (rigid) or 8 (homography)"),
+        (["--set", "warp.dof=4"], "expected 1 (rotation), 2 (translation), 3 (rigid), 6 (pose) or 8 (homography)"),
+        (["--set", "warp.dof=6"], "expected 1 (rotation), 2 (translation), 3 (rigid) or 8 (homography)"),
+        (["--set", "warp.method=se3-field"], "moves cameras in space"),
+        (["--set", "warp.activation=swish"], "expected one of"),
+        (["--set", "field.kind=wavelet"], "expected one of"),
+        (["--set", "loss.cycle=-1"], "a weight of 0 or more"),
         (["--set", "data.patch_crop=[11,12]"], "even number"),
         (["--set", "data.patch_crop=[10,40]"], "larger than the image"),
         (["--set", "optim.lr=-1"], "above 0"),
@@ -78,6 +83,23 @@ fn values_of_the_wrong_type_or_range() {
         mentions(&w.refuse(&args), &[expected]);
     }
     assert_eq!(w.left_behind(), ["range.toml", "syntax.toml", "type.toml"]);
+}
+
+#[test]
+fn invertible_warps_that_do_not_fit() {
+    let w = Workplace::new();
+    let settings = "base = \"tiny.toml\"\n[warp]\nmethod = \"invertible\"\n";
+    for (more, expected) in [
+        ("[warp.inn]\nblocks = 0\n", ["mine.toml:5", "`warp.inn.blocks`: expected 1 to 64, found 0"]),
+        ("[warp.inn]\nanneal = \"channels\"\nanneal_steps = 0\n", ["mine.toml:6", "expected 1 or more, found 0"]),
+        ("code = 5\n[warp.inn]\ncode = \"posenc\"\n", ["mine.toml:4", "expected an even number, found 5"]),
+        ("[warp.inn]\ntrain_network = false\ntrain_code = false\n", ["mine.toml:5", "nothing of the warp is trained"]),
+        ("[warp.inn]\nblock = 2\n", ["mine.toml:5", "did you mean `warp.inn.blocks`?"]),
+    ] {
+        std::fs::write(w.path("mine.toml"), format!("{settings}{more}")).unwrap();
+        mentions(&w.refuse(&["train", "mine.toml", "--out", "run"]), &expected);
+    }
+    assert_eq!(w.left_behind(), ["mine.toml"]);
 }
 
 #[test]

@@ -3,6 +3,7 @@
 
 mod evaluation;
 mod fits;
+mod inn;
 mod networks;
 mod planar;
 mod primitives;

@@ -60,7 +60,7 @@ fn model(case: &Case, views: usize) -> RadianceModel {
     }
     layered.validate().unwrap();
     let size = ImageSize { height: case.count("H"), width: case.count("W") };
-    RadianceModel::new(&layered.settings, size, views, warps::of_settings(&layered.settings)).unwrap()
+    RadianceModel::new(&layered.settings, size, views, warps::of_settings(&layered.settings, views)).unwrap()
 }
 
 /// A value for every parameter of the model (or its gradient), in the official layout, by the official name.

@@ -2,7 +2,10 @@
 
 use crate::{Choice, output_folder};
 use clap::{Args, ValueEnum};
+use raygrad::Experiment;
 use raygrad::planar::{PlanarData, PlanarModel};
+use raygrad::radiance::data::SpaceDataError;
+use raygrad::radiance::{RadianceModel, SpaceData};
 use raygrad::run::files::write_atomically;
 use raygrad::warps;
 use raygrad_compiler::graph::topological;
@@ -50,11 +53,7 @@ enum TargetChoice {
 pub fn run(args: &ExplainArgs) -> anyhow::Result<ExitCode> {
     let experiment = args.choice.experiment()?;
     experiment.layered.validate().map_err(raygrad::Error::from)?;
-    let settings = &experiment.layered.settings;
-    let data = PlanarData::load(&experiment.layered).map_err(raygrad::Error::from)?;
-    let begun = Instant::now();
-    let step = PlanarModel::new(settings, data.grid, warps::of_settings(settings)).train_step();
-    let recorded = begun.elapsed();
+    let (step, recorded) = record(&experiment)?;
     let gpu = args.target == TargetChoice::Gpu || matches!(args.emit, Some(Artefact::Wgsl | Artefact::Spirv));
     let target = if gpu { Target::gpu() } else { Target::cpu() };
     let program = compile(&step, &target).map_err(raygrad::Error::from)?;
@@ -85,6 +84,23 @@ pub fn run(args: &ExplainArgs) -> anyhow::Result<ExitCode> {
         timing(recorded, &program);
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// The training step, and how long it took to record and differentiate it.
+fn record(experiment: &Experiment) -> Result<(Step, Duration), raygrad::Error> {
+    let settings = &experiment.layered.settings;
+    if settings.scene.is_some() {
+        let data = SpaceData::load(&experiment.layered, &|_, _| {})?;
+        let views = data.scene.train.len();
+        let begun = Instant::now();
+        let warp = warps::of_settings(settings, views);
+        let model = RadianceModel::new(settings, data.size, views, warp).map_err(SpaceDataError::from)?;
+        return Ok((model.train_step(), begun.elapsed()));
+    }
+    let data = PlanarData::load(&experiment.layered)?;
+    let begun = Instant::now();
+    let warp = warps::of_settings(settings, settings.data.patches);
+    Ok((PlanarModel::new(settings, data.grid, warp).train_step(), begun.elapsed()))
 }
 
 /// A file a kernel, numbered in the order in which they run.
