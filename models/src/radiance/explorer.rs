@@ -83,7 +83,8 @@ impl Explorer {
         let found = self.learner.session.get(model::FOUND)?;
         Ok(self
             .data
-            .rough
+            .start
+            .poses
             .iter()
             .zip(found.chunks(12))
             .map(|(rough, found)| rough.after(&Pose::from_rows(found)))
