@@ -37,11 +37,12 @@ pub enum CloudError {
 }
 
 impl Mesh {
-    /// `count` points drawn evenly over the surface; the same every time.
+    /// `count` points drawn evenly over the surface, the same for the same `seed`. Two surfaces to be compared are drawn
+    /// from with two seeds, so that their points do not match by construction.
     ///
     /// # Errors
     /// If the mesh has no surface.
-    pub fn sample(&self, count: usize) -> Result<Vec<[f64; 3]>, MeshError> {
+    pub fn sample(&self, count: usize, seed: u32) -> Result<Vec<[f64; 3]>, MeshError> {
         let mut sum = 0.0;
         let areas = (0..self.triangles.len()).map(|i| self.triangle_area(i));
         let upto: Vec<f64> = areas
@@ -53,7 +54,7 @@ impl Mesh {
         if !(sum > 0.0 && sum.is_finite()) {
             return Err(MeshError::NoSurface);
         }
-        let mut random = Random::new(0, "surface");
+        let mut random = Random::new(seed, "surface");
         let point = |_| {
             let place = random.uniform() * sum;
             let triangle = upto.partition_point(|u| *u <= place).min(upto.len() - 1);
@@ -128,12 +129,13 @@ mod tests {
 
     #[test]
     fn two_squares_lie_their_distance_apart() {
-        let (a, b) = (square(1.0, 0.0).sample(20_000).unwrap(), square(1.0, 0.2).sample(20_000).unwrap());
+        let (a, b) = (square(1.0, 0.0).sample(20_000, 0).unwrap(), square(1.0, 0.2).sample(20_000, 1).unwrap());
         assert!((chamfer(&a, &b, None).unwrap().mean() - 0.2).abs() < 1e-3);
         assert!(a.iter().all(|p| p[2] == 0.0 && (0.0..=1.0).contains(&p[0])));
         let mean_x = a.iter().map(|p| p[0]).sum::<f64>() / a.len() as f64;
         assert!((mean_x - 0.5).abs() < 0.01, "points lie unevenly: {mean_x}");
-        assert_eq!(a, square(1.0, 0.0).sample(20_000).unwrap());
+        assert_eq!(a, square(1.0, 0.0).sample(20_000, 0).unwrap());
+        assert_ne!(a, square(1.0, 0.0).sample(20_000, 1).unwrap());
         // What lies beyond the limit does not count.
         let mut far = b.clone();
         far.push([100.0, 0.0, 0.0]);
@@ -143,8 +145,8 @@ mod tests {
 
     #[test]
     fn nothing_to_compare_is_refused() {
-        assert!(matches!(Mesh::default().sample(5), Err(MeshError::NoSurface)));
-        assert!(matches!(square(0.0, 1.0).sample(5), Err(MeshError::NoSurface)));
+        assert!(matches!(Mesh::default().sample(5, 0), Err(MeshError::NoSurface)));
+        assert!(matches!(square(0.0, 1.0).sample(5, 0), Err(MeshError::NoSurface)));
         assert_eq!(chamfer(&[], &[[0.0; 3]], None).unwrap_err(), CloudError::Empty { which: "mesh" });
         let broken = chamfer(&[[0.0; 3]], &[[0.0; 3], [0.0, f64::NAN, 0.0]], None).unwrap_err();
         assert!(broken.to_string().contains("point 1 of the reference"), "{broken}");
