@@ -6,6 +6,7 @@ use crate::planar::DataError;
 use crate::report::PlotError;
 use crate::run::files::WriteError;
 use crate::run::{CheckpointError, FolderError};
+use crate::scene::{NoiseError, SceneError, make_scene::MakeError};
 use raygrad_compiler::StepError;
 use raygrad_runtime::{DeviceError, RunError};
 
@@ -15,6 +16,12 @@ pub enum Error {
     Config(#[from] ConfigError),
     #[error(transparent)]
     Data(#[from] DataError),
+    #[error(transparent)]
+    Scene(#[from] SceneError),
+    #[error(transparent)]
+    Noise(#[from] NoiseError),
+    #[error(transparent)]
+    MakeScene(#[from] MakeError),
     #[error(transparent)]
     Device(#[from] DeviceError),
     #[error(transparent)]
