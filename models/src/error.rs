@@ -8,6 +8,7 @@ use crate::radiance::data::SpaceDataError;
 use crate::report::PlotError;
 use crate::run::files::WriteError;
 use crate::run::{CheckpointError, FolderError};
+use crate::scene::{NoiseError, SceneError, make_scene::MakeError};
 use raygrad_compiler::StepError;
 use raygrad_runtime::{DeviceError, RunError};
 
@@ -21,6 +22,12 @@ pub enum Error {
     Space(#[from] SpaceDataError),
     #[error(transparent)]
     Image(#[from] ImageError),
+    #[error(transparent)]
+    Scene(#[from] SceneError),
+    #[error(transparent)]
+    Noise(#[from] NoiseError),
+    #[error(transparent)]
+    MakeScene(#[from] MakeError),
     #[error(transparent)]
     Device(#[from] DeviceError),
     #[error(transparent)]

@@ -21,6 +21,12 @@ pub struct PlotError {
     problem: String,
 }
 
+impl PlotError {
+    pub(crate) fn new(what: &str, problem: &str) -> PlotError {
+        PlotError { what: what.to_string(), problem: problem.to_string() }
+    }
+}
+
 const SIZE: (u32, u32) = (640, 340);
 const GRID: RGBColor = RGBColor(0xe8, 0xea, 0xee);
 const AXIS: RGBColor = RGBColor(0x9a, 0xa1, 0xab);
@@ -41,7 +47,7 @@ pub fn plot(what: &str, curves: &[Curve], logarithmic: bool) -> Result<String, P
         let margin = ((high - low) * 0.05).max(1e-9);
         draw(&mut svg, what, curves, last, (low - margin, high + margin), false)
     };
-    drawn.map_err(|e| PlotError { what: what.to_string(), problem: e.to_string() })?;
+    drawn.map_err(|e| PlotError::new(what, &e.to_string()))?;
     Ok(svg)
 }
 

@@ -18,6 +18,7 @@ pub mod noise;
 mod normalise;
 mod numpy;
 mod picture;
+pub mod plot;
 mod resize;
 mod transforms;
 

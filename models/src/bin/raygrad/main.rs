@@ -4,7 +4,9 @@
 //! with a checkpoint.
 
 mod bench;
+mod data;
 mod explain;
+mod make_scene;
 mod progress;
 mod train;
 
@@ -35,6 +37,10 @@ enum Command {
     Explain(explain::ExplainArgs),
     /// Time the training step of an experiment.
     Bench(bench::BenchArgs),
+    /// Print what a folder of images and cameras holds: layout, views, intrinsics, depths, where the cameras are.
+    Data(data::DataArgs),
+    /// Make a small scene with exact cameras and depths, to try things on.
+    MakeScene(make_scene::MakeSceneArgs),
 }
 
 /// What names an experiment.
@@ -93,6 +99,8 @@ fn main() -> ExitCode {
         Command::Presets => presets(),
         Command::Explain(args) => explain::run(&args),
         Command::Bench(args) => bench::run(&args),
+        Command::Data(args) => data::run(&args),
+        Command::MakeScene(args) => make_scene::run(&args),
     };
     match done {
         Ok(code) => code,

@@ -223,7 +223,8 @@ mod tests {
             }
         }
         assert!(compared > 200 && agree + nearer > compared * 9 / 10, "{agree} and {nearer} of {compared}");
-        assert!(agree > compared / 2, "{agree} of {compared}");
+        // The two stand nearly opposite each other, so that most of what one sees is hidden from the other.
+        assert!(agree > compared / 6, "{agree} of {compared}");
         let opaque = a.mask.as_ref().unwrap().iter().zip(a.depth.as_ref().unwrap());
         assert!(
             opaque.clone().all(|(m, z)| *m < 1.0 || *z > 0.0) && opaque.clone().all(|(m, z)| *m > 0.0 || *z == 0.0)
