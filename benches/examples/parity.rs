@@ -4,6 +4,7 @@
 
 use anyhow::{Context, ensure};
 use raygrad::Experiment;
+use raygrad::training::Training;
 use raygrad_benches::{Table, quick, train};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};

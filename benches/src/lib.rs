@@ -4,6 +4,7 @@
 
 use raygrad::Experiment;
 use raygrad::planar::Trainer;
+use raygrad::training::Training;
 use std::fmt::Display;
 use std::io::IsTerminal;
 use std::time::Instant;
