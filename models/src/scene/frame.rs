@@ -22,8 +22,10 @@ impl WorldFrame {
     /// A world-to-camera pose of the file's world in the loaded one.
     pub fn load(&self, pose: &Pose) -> Pose {
         let rotation = pose.rotation * self.linear.transpose();
-        let center = self.scale * (self.linear * pose.center()) + self.offset;
-        Pose { rotation, translation: -(rotation * center) }
+        // -R' (s L c + offset) with R c = -t taken out: files with rounded rotations keep their t exactly where L is one.
+        let bent = Matrix3::identity() - self.linear.transpose() * self.linear;
+        let translation = self.scale * (pose.translation + pose.rotation * (bent * pose.center()));
+        Pose { rotation, translation: translation - rotation * self.offset }
     }
 
     /// A world-to-camera pose of the loaded world in the file's one, its rotation made exact.

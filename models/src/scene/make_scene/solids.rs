@@ -7,10 +7,10 @@ use nalgebra::Vector3;
 type V = Vector3<f64>;
 
 /// Height of the ground.
-const GROUND: f64 = -0.6;
+const GROUND: f64 = -0.4;
 /// Rays to the light start so far from where they left.
 const OFFSET: f64 = 1e-6;
-const AMBIENT: f64 = 0.35;
+const AMBIENT: f64 = 0.45;
 
 enum Form {
     Sphere(f64),
@@ -46,7 +46,7 @@ impl World {
         let mut random = Random::new(seed, "solids");
         let mut solids = vec![];
         let ground = Texture::new(&mut random, 4.0, true);
-        solids.push(Solid { form: Form::Disc(1.25), place: place(V::new(0.0, 0.0, GROUND), 0.0), texture: ground });
+        solids.push(Solid { form: Form::Disc(1.15), place: place(V::new(0.0, 0.0, GROUND), 0.0), texture: ground });
         let forms = [
             (Form::Sphere(0.42), -0.45, -0.35),
             (Form::Block(V::new(0.28, 0.28, 0.5)), 0.45, 0.3),
@@ -135,8 +135,8 @@ impl Solid {
 
 impl Texture {
     fn new(random: &mut Random, frequency: f64, checks: bool) -> Texture {
-        let mut color = |low: f64| V::from_fn(|_, _| low + 0.65 * random.uniform());
-        let colors = [color(0.0), color(0.35)];
+        let mut color = |low: f64| V::from_fn(|_, _| low + 0.6 * random.uniform());
+        let colors = [color(0.1), color(0.4)];
         Texture { colors, frequency, checks, seed: random.next_u32() }
     }
 
