@@ -32,7 +32,7 @@ raygrad() {
         if [ "$1" = --steps ]; then shift 2; else args+=("$1"); shift; fi
     done
     # Settings given last win over those of the preset, not over those of the documented command.
-    case "${args[*]}" in *points_per_patch*) ;; *) [ $runs = no ] || short+=(--set data.points_per_patch=64) ;; esac
+    case "${args[*]}" in *points_per_patch* | *scene.*) ;; *) [ $runs = no ] || short+=(--set data.points_per_patch=64) ;; esac
     "$binary" "${args[@]}" "${short[@]}"
 }
 

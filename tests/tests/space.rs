@@ -1,0 +1,193 @@
+//! The graphs of registration in space, whole: every warp, first and second order, on every device.
+
+use raygrad::config::Layered;
+use raygrad::geometry::Pose;
+use raygrad::radiance::RadianceModel;
+use raygrad::radiance::model::{FOUND, INTRINSICS, POSES, nothing_found};
+use raygrad::radiance::rays::ImageSize;
+use raygrad::training::Rates;
+use raygrad::warps;
+use raygrad_compiler::autodiff::grad;
+use raygrad_compiler::functions::mlp::Init;
+use raygrad_compiler::graph::{Tensor, topological};
+use raygrad_compiler::ops::input::{Input, Role};
+use raygrad_compiler::reference::{Array, Bindings, evaluate};
+use raygrad_compiler::scalar::DType;
+use raygrad_compiler::{Program, Step, Target, compile};
+use raygrad_tests::backend::devices_for_large_programs;
+use raygrad_tests::check::check;
+use raygrad_tests::{Rng, seed, total};
+
+const VIEWS: usize = 3;
+const SIZE: ImageSize = ImageSize { height: 6, width: 8 };
+
+/// A preset at the size of a test, with some settings changed.
+fn model(preset: &str, set: &[&str]) -> RadianceModel {
+    let mut layered = Layered::load(preset).unwrap_or_else(|e| panic!("{e}"));
+    let small = [
+        "scene.image_size=[6,8]",
+        "train.rays=12",
+        "train.samples=8",
+        "field.layers=[12,12,12]",
+        "field.bands=2",
+        "radiance.skip=[2]",
+        "radiance.color_layers=[8]",
+        "radiance.view_bands=1",
+        "warp.code=4",
+        "warp.layers=[8,8]",
+        "warp.skip=[1]",
+        "warp.bands=2",
+        "warp.inn.hidden=8",
+    ];
+    for text in small.iter().chain(set) {
+        layered.set(text).unwrap_or_else(|e| panic!("{preset}: {e}"));
+    }
+    layered.validate().unwrap_or_else(|e| panic!("{preset}: {e}"));
+    let warp = warps::of_settings(&layered.settings, VIEWS);
+    RadianceModel::new(&layered.settings, SIZE, VIEWS, warp).unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// Cameras around the origin at a distance of 4, lenses of 10 pixels, and random values for everything else.
+fn bind(model: &RadianceModel, roots: &[Tensor], rng: &mut Rng) -> Bindings {
+    let poses: Vec<f64> = (0..VIEWS)
+        .flat_map(|i| {
+            let mut pose = Pose::exp(&[0.2, 1.3 * i as f64, -0.1, 0.0, 0.0, 0.0]);
+            pose.translation = nalgebra::Vector3::new(0.1, -0.2, 4.0);
+            pose.to_rows()
+        })
+        .collect();
+    let lens = (0..VIEWS).flat_map(|_| [10.0, 11.0, 4.0, 3.0]).collect();
+    let found = nothing_found(VIEWS).iter().map(|x| f64::from(*x)).collect();
+    let fixed = [(POSES, poses), (INTRINSICS, lens), (FOUND, found)];
+    let rates = Rates::at(&model.settings.optim, 70_000).inputs();
+    let mut bound = Bindings::new();
+    for t in topological(roots.iter().cloned()) {
+        let Some(Input { name, role, shape }) = t.op_as::<Input>() else { continue };
+        let known = fixed.iter().find(|(n, _)| n == name).map(|(_, v)| v.clone());
+        let rate = rates.iter().find(|(n, _)| n == name).map(|(_, v)| vec![f64::from(*v as f32)]);
+        let spread = |init: &Init| match init {
+            Init::Uniform(bound) => *bound,
+            Init::Normal(deviation) => *deviation,
+            _ => 0.1,
+        };
+        let value = match known.or(rate) {
+            Some(values) => Array::floats(shape, values),
+            None if shape.dtype == DType::U32 => Array::integers(shape, vec![70_000; shape.lanes()]),
+            None if *role == Role::Parameter => {
+                let parameters = model.parameters();
+                let of =
+                    parameters.iter().find(|p| p.tensor.input_name() == Some(name)).map_or(0.1, |p| spread(&p.init));
+                rng.array(shape, -of, of)
+            }
+            None if *role == Role::State => Array::zeros(shape),
+            None => rng.array(shape, 0.0, 1.0),
+        };
+        bound.insert(name.clone(), value);
+    }
+    bound
+}
+
+fn output(step: &Step, name: &str) -> Tensor {
+    step.outputs.iter().find(|(n, _)| n == name).expect("an output of the step").1.clone()
+}
+
+fn check_model(preset: &str, set: &[&str]) {
+    let name = format!("{preset} {}", set.join(" "));
+    let model = model(preset, set);
+    let mut rng = Rng(seed(&name));
+    let step = model.train_step();
+    let loss = output(&step, "total");
+    let parameters: Vec<Tensor> = model.parameters().into_iter().map(|p| p.tensor).collect();
+    let wanted: Vec<&Tensor> = parameters.iter().collect();
+    let first = grad(&loss, &wanted);
+    let mut bound = bind(&model, &step.roots(), &mut rng);
+    // The derivative along a random direction, and its derivatives.
+    let along = |g: &Tensor, p: &Tensor| {
+        let direction = Tensor::data(format!("direction {}", p.input_name().unwrap_or_default()), g.shape().clone());
+        total(&(g * direction))
+    };
+    let slope = first.iter().zip(&parameters).map(|(g, p)| along(g, p)).reduce(|a, b| a + b).expect("parameters");
+    for (g, p) in first.iter().zip(&parameters) {
+        let name = format!("direction {}", p.input_name().unwrap_or_default());
+        bound.insert(name, rng.array(g.shape(), -1.0, 1.0));
+    }
+    let second = grad(&slope, &wanted);
+    check_difference(&format!("{name}, first order"), &loss, &slope, &parameters, &bound);
+    let turned: Tensor = {
+        let pairs = second.iter().zip(&parameters);
+        pairs.map(|(g, p)| along(&g.broadcast_to(p.axes()), p)).reduce(|a, b| a + b).expect("parameters")
+    };
+    check_difference(&format!("{name}, second order"), &slope, &turned, &parameters, &bound);
+    let mut outputs = step.outputs;
+    let named = |order: &'static str| move |(p, g): (&Tensor, Tensor)| (format!("{order} {p:?}"), g);
+    outputs.extend(parameters.iter().zip(first.clone()).map(named("first")));
+    outputs.extend(parameters.iter().zip(second).map(named("second")));
+    let step = Step { outputs, updates: vec![] };
+    check(&devices_for_large_programs(), &step, &bound).unwrap_or_else(|e| panic!("{name}: {e}"));
+}
+
+/// Compares `slope`, the derivative of `scalar` along the bound directions of all parameters, with central differences:
+/// a difference across a kink is no derivative, a shorter one does not reach it.
+fn check_difference(what: &str, scalar: &Tensor, slope: &Tensor, parameters: &[Tensor], bound: &Bindings) {
+    let value = |t: &Tensor, bound: &Bindings| {
+        evaluate(std::slice::from_ref(t), bound).unwrap_or_else(|e| panic!("{what}: {e}"))[0].f()[0]
+    };
+    let found = value(slope, bound);
+    let expected: Vec<f64> = [1e-4, 1e-5, 1e-6]
+        .iter()
+        .map(|step| {
+            let at = |sign: f64| {
+                let mut moved = bound.clone();
+                for p in parameters {
+                    let name = p.input_name().unwrap_or_default();
+                    let along = bound[&format!("direction {name}")].f().to_vec();
+                    let array = moved.get_mut(name).expect("a bound parameter");
+                    array.f_mut().iter_mut().zip(along).for_each(|(x, d)| *x += sign * step * d);
+                }
+                value(scalar, &moved)
+            };
+            (at(1.0) - at(-1.0)) / (2.0 * step)
+        })
+        .collect();
+    let agrees = expected.iter().any(|e| (found - e).abs() <= 1e-5 * (1.0 + e.abs()));
+    assert!(agrees, "{what}: the graph gives {found}, central differences give {expected:?}");
+}
+
+#[test]
+fn known_and_global_poses() {
+    check_model("nerf-blender", &[]);
+    check_model("barf-blender", &["train.opaque_background=true", "radiance.density=relu"]);
+    check_model("barf-llff", &[]);
+}
+
+#[test]
+fn local_motions() {
+    check_model("l2g-blender", &[]);
+    check_model("l2g-llff", &["radiance.view_dependent=false"]);
+}
+
+#[test]
+fn invertible_warps() {
+    check_model("inn-llff", &[]);
+    check_model("inn-blender", &["warp.method=multi-invertible"]);
+}
+
+#[test]
+fn plain_networks() {
+    check_model("inn-blender", &["warp.method=mlp"]);
+    check_model("inn-blender", &["warp.method=implicit-mlp"]);
+    check_model("inn-blender", &["warp.method=se3-field"]);
+}
+
+/// On a CPU the network of a step runs once forwards and once backwards, in one launch.
+#[test]
+fn the_network_runs_once() {
+    let mut layered = Layered::load("l2g-blender").unwrap_or_else(|e| panic!("{e}"));
+    layered.set("train.rays=200").unwrap_or_else(|e| panic!("{e}"));
+    let size = ImageSize { height: 20, width: 20 };
+    let warp = warps::of_settings(&layered.settings, 100);
+    let model = RadianceModel::new(&layered.settings, size, 100, warp).unwrap_or_else(|e| panic!("{e}"));
+    let program: Program = compile(&model.train_step(), &Target::cpu()).unwrap_or_else(|e| panic!("{e}"));
+    let excess = program.flops() as f64 / model.flops();
+    assert!(excess < 1.05, "{excess:.3} times the operations of one pass:\n{program}");
+}
