@@ -175,13 +175,19 @@ impl Bench {
 
 /// Checks the derivatives of a warp, first and second order, and its values and gradients on every device there is.
 pub fn check_gradients(warp: &dyn Warp) -> Result<(), TestError> {
+    check_gradients_on(warp, &devices()?)
+}
+
+/// The same with values and gradients on these devices, which have names for messages: a warp of many kernels takes minutes
+/// on a software GPU.
+pub fn check_gradients_on(warp: &dyn Warp, devices: &[(String, Device)]) -> Result<(), TestError> {
     let bench = Bench::new(warp)?;
     let (mut bindings, mut random) = (bench.bindings.clone(), Random::new(1, "testing"));
     let slope = bench.check("first", &bench.scalar, &mut bindings, &mut random)?;
     bench.check("second", &slope, &mut bindings, &mut random)?;
     let step = bench.step();
     let expected = evaluate(&step.roots(), &bench.bindings)?;
-    for (name, device) in devices()? {
+    for (name, device) in devices {
         let mut session = Session::new(device.clone())?;
         let program = session.add(compile(&step, &device.target())?)?;
         for (input, value) in &bench.bindings {
@@ -232,7 +238,7 @@ fn wgsl(_: &Program) -> Result<String, TestError> {
 }
 
 /// The CPU, and an adapter if there is one.
-fn devices() -> Result<Vec<(String, Device)>, DeviceError> {
+pub fn devices() -> Result<Vec<(String, Device)>, DeviceError> {
     let mut devices = vec![("cpu".to_string(), Device::cpu(Some(1))?)];
     devices.extend(Device::wgpu(None).ok().map(|d| ("wgpu".to_string(), d)));
     Ok(devices)
