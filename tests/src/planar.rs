@@ -34,6 +34,17 @@ pub const SMALL: [&str; 7] = [
     "field.bands=3",
 ];
 
+/// The same graph with networks so narrow that software drivers compile its kernels in seconds.
+pub const TINY: [&str; 7] = [
+    "data.patches=3",
+    "data.patch_crop=[8,10]",
+    "warp.code=3",
+    "warp.layers=[6,6]",
+    "warp.skip=[1]",
+    "field.layers=[6,6]",
+    "field.bands=2",
+];
+
 impl Planar {
     /// A preset with some settings changed.
     pub fn new(preset: &str, set: &[&str]) -> Planar {

@@ -3,7 +3,7 @@
 //! Few rows: an invocation a result runs over them. Many rows: a workgroup takes a chunk of them, its invocations every
 //! 64th row each, and combines through workgroup memory; a second kernel combines the chunks.
 
-use super::builder::{Builder, Kind, Value, Var};
+use super::builder::{Builder, Kind, Memory, Value, Var};
 use super::channels::is_indexable;
 use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
@@ -211,7 +211,6 @@ impl Reducer<'_> {
         self.step(&mut e, &totals, kept, channel, row);
         e.b.close_loop();
 
-        // One invocation a target sums what the workgroup's 64 found.
         let count = self.targets.len() as u32;
         let found = e.b.workgroup("found", Kind::F32, false, count * WORKGROUP);
         for (i, total) in totals.iter().enumerate() {
@@ -221,63 +220,64 @@ impl Reducer<'_> {
             e.b.store(found, at, value);
         }
         e.b.barrier();
-        let kinds: Vec<Reduction> = self.targets.iter().map(|t| t.kind).collect();
-        let uniform = kinds.iter().all(|k| *k == kinds[0]);
-        let combined = |e: &mut Emit, first: Value, kind: Reduction| {
-            let start = neutral(&mut e.b, kind);
-            let total = e.b.var("all", start);
-            let (from, to) = (e.b.u(0), e.b.u(WORKGROUP));
-            let i = e.b.open_loop("other", from, to, 4);
-            for j in 0..4 {
-                let offset = e.b.u(j);
-                let at = e.b.add(i, offset);
-                let at = e.b.add(at, first);
-                let next = e.b.load(found, at);
-                let so_far = e.b.get(total);
-                let next = combine(&mut e.b, kind, so_far, next);
-                e.b.set(total, next);
+
+        // One invocation a target sums what the workgroup's 64 found. The code is shared by targets that follow each
+        // other, because drivers take long over many copies of a loop.
+        let size = e.b.u(WORKGROUP);
+        let own = e.b.mul(e.invocation, size);
+        let mut begin = 0;
+        while begin < self.targets.len() {
+            let t = &self.targets[begin];
+            let alike = |u: &&Target| u.kind == t.kind && (u.store == t.store || partials.is_some());
+            let end = begin + self.targets[begin..].iter().take_while(alike).count();
+            let (from, to) = (e.b.u(begin as u32), e.b.u(end as u32));
+            let mut mine = e.b.less(e.invocation, to);
+            if begin > 0 {
+                let reached = e.b.binary(naga::BinaryOperator::GreaterEqual, e.invocation, from);
+                mine = e.b.and(reached, mine);
             }
-            e.b.close_loop();
-            e.b.get(total)
-        };
-        if let (Some(partials), true) = (partials, uniform) {
-            let limit = e.b.u(count);
-            let mine = e.b.less(e.invocation, limit);
             e.b.open_if(mine);
-            let size = e.b.u(WORKGROUP);
-            let first = e.b.mul(e.invocation, size);
-            let total = combined(&mut e, first, kinds[0]);
-            let block = e.b.mul(chunk, limit);
-            let block = e.b.add(block, e.invocation);
-            let block = e.b.mul(block, results_value);
-            let at = e.b.add(block, result);
-            e.store(partials, at, total);
-            e.b.close_if();
-            return e.finish(name);
-        }
-        for (i, t) in self.targets.iter().enumerate() {
-            let own = e.b.u(i as u32);
-            let mine = e.b.binary(naga::BinaryOperator::Equal, e.invocation, own);
-            e.b.open_if(mine);
-            let first = e.b.u(i as u32 * WORKGROUP);
-            let total = combined(&mut e, first, t.kind);
+            let total = self.combined(&mut e, found, own, t.kind);
             match partials {
                 Some(partials) => {
-                    let (count, own) = (e.b.u(count), e.b.u(i as u32));
+                    let count = e.b.u(count);
                     let block = e.b.mul(chunk, count);
-                    let block = e.b.add(block, own);
+                    let block = e.b.add(block, e.invocation);
                     let block = e.b.mul(block, results_value);
                     let at = e.b.add(block, result);
                     e.store(partials, at, total);
                 }
                 None => {
-                    let at = self.index(&mut e, t, kept, channel);
+                    // Channels of a store's targets follow each other.
+                    let (ahead, first) = (e.b.sub(e.invocation, from), e.b.u(t.channel));
+                    let own = e.b.add(ahead, first);
+                    let at = e.index(self.buffer(t), if self.by_lane { channel } else { own }, kept);
                     e.store(self.buffer(t), at, total);
                 }
             }
             e.b.close_if();
+            begin = end;
         }
         e.finish(name)
+    }
+
+    /// The 64 values from `first` on, combined in order.
+    fn combined(&self, e: &mut Emit, found: Memory, first: Value, kind: Reduction) -> Value {
+        let start = neutral(&mut e.b, kind);
+        let total = e.b.var("all", start);
+        let (from, to) = (e.b.u(0), e.b.u(WORKGROUP));
+        let i = e.b.open_loop("other", from, to, 4);
+        for j in 0..4 {
+            let offset = e.b.u(j);
+            let at = e.b.add(i, offset);
+            let at = e.b.add(at, first);
+            let next = e.b.load(found, at);
+            let so_far = e.b.get(total);
+            let next = combine(&mut e.b, kind, so_far, next);
+            e.b.set(total, next);
+        }
+        e.b.close_loop();
+        e.b.get(total)
     }
 }
 
