@@ -2,7 +2,7 @@
 
 use raygrad::config::{Anneal, Dof, Layered, Lift, WarpSettings};
 use raygrad::data::initial_values;
-use raygrad::planar::rates::STEP;
+use raygrad::training::optimise::STEP;
 use raygrad::warps::{InvertibleWarp, Points, Registration, Warp};
 use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::functions::loss::mean_squared_error;
@@ -186,7 +186,7 @@ fn constant_networks_are_rigid() {
             angles[block.parse::<usize>().expect("a number")] = values[0];
         }
     }
-    let found = Registration::new(&bench.warp, &bench.at, &bench.code, false);
+    let found = Registration::new(&bench.warp, &bench.at, None, &bench.code, false);
     let residual = found.residual.expect("a fitted warp has a residual");
     let world = apply_affine(&invert_pose(&found.transform), &bench.points);
     let values = bench.bound.run(&[residual, found.local, world, invert_pose(&found.transform)]);
@@ -211,7 +211,7 @@ fn constant_networks_are_rigid() {
 #[test]
 fn the_gradient_through_the_fit_is_zero() {
     let bench = Bench::new(&small(&[]), 2, 20, Some(0.5));
-    let found = Registration::new(&bench.warp, &bench.at, &bench.code, false);
+    let found = Registration::new(&bench.warp, &bench.at, None, &bench.code, false);
     let composed = mean_squared_error(&found.local, &found.global);
     let parameters: Vec<Tensor> = bench.warp.parameters().into_iter().map(|p| p.tensor).collect();
     let wanted: Vec<&Tensor> = parameters.iter().collect();

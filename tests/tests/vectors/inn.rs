@@ -1,7 +1,7 @@
 //! The invertible warp: encoding, map, inverse, gradients, annealing, activations, rigidity prior.
 
 use raygrad::config::{Anneal, Dof, InnSettings, Layered, WarpSettings};
-use raygrad::planar::rates::STEP;
+use raygrad::training::optimise::STEP;
 use raygrad::warps::{InvertibleWarp, Points, Registration, Warp};
 use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::functions::posenc::{coarse_to_fine_weights, frequency_encoding};
@@ -111,7 +111,7 @@ fn rigidity_prior() {
         let source = bound.data("source", &[&frame, &point], 3, case.numbers("source"));
         let warped = bound.data("warped", &[&frame, &point], 3, case.numbers("warped"));
         let at = Points::planar(frame, point, source);
-        let found = Registration::new(&Given(warped.clone()), &at, &Tensor::scalar(0.0), false);
+        let found = Registration::new(&Given(warped.clone()), &at, None, &Tensor::scalar(0.0), false);
         let loss = found.residual.expect("a fitted warp has a residual");
         let slope = grad(&loss, &[&warped]).remove(0);
         let values = bound.run(&[loss, slope, found.transform]);
