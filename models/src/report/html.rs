@@ -140,7 +140,8 @@ impl Report<'_> {
             let caption = "Distance between estimated and true patch corners.";
             plots.push((caption, plot("corner error, px", &corners, true)?));
         }
-        let errors: [(_, &str, fn(&Entry) -> Option<f64>); 2] = [
+        type Value = fn(&Entry) -> Option<f64>;
+        let errors: [(&str, &str, Value); 2] = [
             ("Rotation error of the training views, after alignment.", "degrees", |e| match e.measured {
                 Measured::Space { rotation_error_deg, .. } => rotation_error_deg,
                 Measured::Planar { .. } => None,
