@@ -119,8 +119,6 @@ pub enum Density {
 #[serde(deny_unknown_fields)]
 pub struct Noise {
     pub kind: NoiseKind,
-    /// In 2D.
-    #[serde(default)]
     pub homography: f64,
     pub rotation: f64,
     pub translation: f64,

@@ -1,0 +1,134 @@
+//! Runs in space from start to end, on the built-in scene at a size for a test.
+
+use raygrad::{Experiment, Observer, Quiet};
+use serde_json::Value;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+const STEPS: usize = 12;
+
+/// `l2g-small` on a few views of 16 x 16 pixels, with some settings changed.
+fn tiny(set: &[&str], out: &Path) -> Experiment {
+    let small = [
+        "scene.image_size=[16,16]",
+        "scene.train_views=5",
+        "scene.val_views=1",
+        "scene.test_views=2",
+        "train.rays=20",
+        "train.samples=8",
+        "train.refine_steps=3",
+        "field.layers=[16,16,16]",
+        "field.bands=2",
+        "radiance.skip=[2]",
+        "radiance.color_layers=[8]",
+        "warp.code=4",
+        "warp.layers=[8,8]",
+        "warp.skip=[1]",
+        "warp.inn.hidden=8",
+        "run.device=cpu",
+        "run.threads=1",
+        "run.log_every=4",
+        "run.picture_every=6",
+        "run.checkpoint_every=5",
+    ];
+    let steps = format!("optim.steps={STEPS}");
+    let all = small.iter().chain(set).copied().chain([steps.as_str()]);
+    let experiment = all.fold(Experiment::preset("l2g-small").unwrap(), |e, text| e.set(text).unwrap());
+    experiment.out(out)
+}
+
+/// Stops a run after some steps.
+struct StopAt<'a> {
+    at: usize,
+    stop: &'a AtomicBool,
+}
+
+impl Observer for StopAt<'_> {
+    fn step(&mut self, done: usize) {
+        self.stop.store(done == self.at, Ordering::Relaxed);
+    }
+}
+
+#[test]
+fn an_interrupted_run_resumes_bit_by_bit_with_every_method() {
+    let methods = [
+        &["warp.method=local"][..],
+        &["warp.method=global"],
+        &["warp.method=none", "scene.poses=truth"],
+        &["warp.method=invertible", "warp.activation=softplus", "warp.inn.anneal=point-slots"],
+        &["warp.method=multi-invertible"],
+    ];
+    for set in methods {
+        let dir = tempfile::tempdir().unwrap();
+        let (whole, parts) = (dir.path().join("whole"), dir.path().join("parts"));
+        let outcome = tiny(set, &whole).train().unwrap_or_else(|e| panic!("{set:?}: {e}"));
+        assert!(!outcome.interrupted && outcome.summary.contains("test PSNR"), "{set:?}: {}", outcome.summary);
+        let stop = AtomicBool::new(false);
+        let outcome = tiny(set, &parts).train_observed(&mut StopAt { at: 7, stop: &stop }, &stop).unwrap();
+        assert!(outcome.interrupted);
+        let stop = AtomicBool::new(false);
+        let outcome = tiny(set, &parts).resume(true).train_observed(&mut Quiet, &stop).unwrap();
+        assert!(!outcome.interrupted);
+        let tensors = |run: &Path| std::fs::read(run.join(format!("checkpoint-{STEPS:07}.safetensors"))).unwrap();
+        assert!(tensors(&parts) == tensors(&whole), "{set:?}");
+        let evaluation = |run: &Path| std::fs::read_to_string(run.join("evaluation.json")).unwrap();
+        assert_eq!(evaluation(&parts), evaluation(&whole), "{set:?}");
+    }
+}
+
+#[test]
+fn a_run_leaves_poses_views_and_scores() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = dir.path().join("run");
+    tiny(&[], &run).train().unwrap();
+    let json = |name: &str| -> Value { serde_json::from_slice(&std::fs::read(run.join(name)).unwrap()).unwrap() };
+    let scores = json("evaluation.json");
+    for key in ["rotation_error_deg", "translation_error_x100", "psnr_db", "ssim", "refined_psnr_db", "refined_ssim"] {
+        assert!(scores[key].as_f64().unwrap().is_finite(), "{key}: {scores}");
+    }
+    assert_eq!(scores["views"].as_array().unwrap().len(), 2);
+    assert_eq!(json("poses.json")["aligned"].as_array().unwrap().len(), 5);
+    let metrics = json("metrics.json");
+    assert_eq!(metrics["steps"].as_array().unwrap().len(), 3);
+    assert!(metrics["final"]["rotation_error_deg"].as_f64().unwrap() > 0.0);
+    for name in
+        ["initial_poses.json", "report.html", "test/000.png", "test/001_depth.png", "test_views.png", "training.png"]
+    {
+        assert!(run.join(name).exists(), "{name} is missing");
+    }
+    // The poses that the run started from are a start for another one.
+    let again = dir.path().join("again");
+    let poses = format!("scene.poses={}", run.join("initial_poses.json").display());
+    tiny(&[&poses], &again).train().unwrap();
+    let first = |run: &Path| std::fs::read(run.join(format!("checkpoint-{STEPS:07}.safetensors"))).unwrap();
+    assert!(first(&run) == first(&again), "the same start gives the same run");
+}
+
+#[test]
+fn bad_scenes_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let refused = |set: &str| {
+        let out = dir.path().join("run");
+        let error = tiny(&[set], &out).train().unwrap_err();
+        assert!(error.is_bad_input(), "{error}");
+        assert!(!out.exists(), "nothing is written");
+        error.to_string()
+    };
+    let message = refused("scene.path=/nowhere/at/all");
+    assert!(message.contains("/nowhere/at/all"), "{message}");
+    let empty = dir.path().join("empty");
+    std::fs::create_dir(&empty).unwrap();
+    let message = refused(&format!("scene.path={}", empty.display()));
+    assert!(message.contains("is not a scene"), "{message}");
+    let message = refused("scene.poses=nowhere.json");
+    assert!(message.contains("nowhere.json"), "{message}");
+    let layered = |set: &str| {
+        let experiment =
+            Experiment::preset("l2g-small").and_then(|e| e.set("train.depth=metric")).and_then(|e| e.set(set));
+        experiment.unwrap().training().err().expect("a refusal").to_string()
+    };
+    let message = layered("train.range=[6.0, 2.0]");
+    assert!(message.contains("`train.range`") && message.contains("near < far"), "{message}");
+    let message = layered("warp.dof=8");
+    assert!(message.contains("`warp.dof`"), "{message}");
+}
