@@ -67,7 +67,6 @@ fn layer(device: &Device, frames: usize, rows: usize, inputs: usize, outputs: us
 }
 
 #[test]
-#[ignore = "minutes of kernel compilation on software drivers: scripts/test.sh --nightly runs it"]
 fn layers_of_all_widths() {
     let Some(device) = device() else { return };
     for (inputs, outputs) in [(2, 1), (3, 4), (5, 7), (16, 12), (34, 64), (64, 64), (64, 3), (70, 33), (130, 66)] {
@@ -239,7 +238,6 @@ impl Training {
 }
 
 #[test]
-#[ignore = "minutes of kernel compilation on software drivers: scripts/test.sh --nightly runs it"]
 fn training_follows_the_reference_and_repeats_bit_by_bit() {
     let Some(device) = device() else { return };
     let training = Training::new();

@@ -1,28 +1,36 @@
-//! Random graphs on every device against the f64 reference.
+//! Random graphs on every device against the f64 reference: large ones on the CPU, smaller ones also on the GPU, where a
+//! software driver spends its time on compiling kernels.
 //!
-//! `RAYGRAD_NIGHTLY=1` runs 10 000 of them, `RAYGRAD_GRAPHS=first..end` those of some seeds. A failure prints the smallest
+//! `RAYGRAD_NIGHTLY=1` runs 10 000 of the large ones, `RAYGRAD_GRAPHS=first..end` those of some seeds. A failure prints the smallest
 //! recipe found that still fails.
 
 use raygrad_compiler::plan::region::RegionOp;
 use raygrad_compiler::{Program, StepError, Target, compile};
 use raygrad_runtime::Device;
-use raygrad_tests::backend::devices_for_large_programs;
+use raygrad_tests::backend::{devices, devices_for_large_programs};
 use raygrad_tests::check::{check, same_bits};
 use raygrad_tests::graphs::{Recipe, shrink};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Mutex;
 
-/// Seeds of the graphs to check: a part of all, so that parts run side by side.
-fn seeds(part: u64, parts: u64) -> impl Iterator<Item = u64> {
+/// Large graphs of a run.
+fn large() -> u64 {
+    if std::env::var_os("RAYGRAD_NIGHTLY").is_some() { 10_000 } else { 600 }
+}
+
+/// Graphs of a run that are small enough for a software GPU, which takes half a second each.
+const SMALL: u64 = 500;
+
+/// Every other seed of the graphs to check, so that halves run side by side.
+fn seeds(count: u64, half: u64) -> impl Iterator<Item = u64> {
     let range = match std::env::var("RAYGRAD_GRAPHS") {
         Ok(text) => {
             let (first, end) = text.split_once("..").expect("RAYGRAD_GRAPHS is first..end");
             first.parse().expect("a number")..end.parse().expect("a number")
         }
-        Err(_) if std::env::var_os("RAYGRAD_NIGHTLY").is_some() => 0..10_000,
-        Err(_) => 0..600,
+        Err(_) => 0..count,
     };
-    range.filter(move |s| s % parts == part)
+    range.filter(move |s| s % 2 == half)
 }
 
 /// What is wrong with a recipe's graph, panics included.
@@ -46,8 +54,7 @@ fn failure(devices: &[Device], recipe: &Recipe) -> Option<String> {
 /// Message and place of the last panic, which may be a device thread's.
 static PANIC: Mutex<String> = Mutex::new(String::new());
 
-fn check_graphs(part: u64, parts: u64) {
-    let devices = devices_for_large_programs();
+fn check_graphs(devices: &[Device], recipe: impl Fn(u64) -> Recipe, seeds: impl Iterator<Item = u64>) {
     let mut failures: Vec<String> = vec![];
     // Panics are failures like others, printed once their graph is small.
     std::panic::set_hook(Box::new(|info| {
@@ -55,11 +62,11 @@ fn check_graphs(part: u64, parts: u64) {
             *text = info.to_string();
         }
     }));
-    for seed in seeds(part, parts) {
-        let recipe = Recipe::new(seed);
-        if failure(&devices, &recipe).is_some() {
-            let small = shrink(&recipe, |r| failure(&devices, r).is_some());
-            let text = failure(&devices, &small).unwrap_or_default();
+    for seed in seeds {
+        let recipe = recipe(seed);
+        if failure(devices, &recipe).is_some() {
+            let small = shrink(&recipe, |r| failure(devices, r).is_some());
+            let text = failure(devices, &small).unwrap_or_default();
             let nodes = raygrad_compiler::graph::topological(small.build().step.roots());
             let nodes: Vec<String> = nodes.iter().map(|t| format!("{t:?}")).collect();
             failures.push(format!("{small:?}\n{}\n{text}", nodes.join("\n")));
@@ -87,10 +94,20 @@ fn reductions_inside_tiles_occur_often() {
 
 #[test]
 fn first_half() {
-    check_graphs(0, 2);
+    check_graphs(&devices_for_large_programs(), Recipe::new, seeds(large(), 0));
 }
 
 #[test]
 fn second_half() {
-    check_graphs(1, 2);
+    check_graphs(&devices_for_large_programs(), Recipe::new, seeds(large(), 1));
+}
+
+#[test]
+fn few_nodes_first_half() {
+    check_graphs(&devices(), Recipe::few_nodes, seeds(SMALL, 0));
+}
+
+#[test]
+fn few_nodes_second_half() {
+    check_graphs(&devices(), Recipe::few_nodes, seeds(SMALL, 1));
 }

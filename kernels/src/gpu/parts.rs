@@ -61,7 +61,13 @@ pub(super) fn lower(layout: &mut Layout, limits: Limits, launch: &Launch) -> Res
                 }
             }
             Part::Layer(r, linear) => kernels.push(layer::kernel(layout, limits, &name, &r, linear)?),
-            Part::Scan(r) => kernels.push(scan::kernel(layout, limits, &name, &r)?),
+            Part::Scan(r) => {
+                let (before, scan) = stages::before_scan(layout, r)?;
+                if let Some(before) = before {
+                    kernels.extend(elements::kernels(layout, limits, &format!("{name}.before"), &before)?);
+                }
+                kernels.push(scan::kernel(layout, limits, &name, &scan)?);
+            }
             Part::Reduce(r) => kernels.extend(reduce::kernels(layout, limits, &name, &r)?),
             Part::Outer(r) => kernels.extend(outer::kernels(layout, limits, &name, &r)?),
             Part::Scatter(r) => kernels.extend(scatter::kernels(layout, limits, &name, &r)?),

@@ -71,6 +71,36 @@ pub(super) fn stages(layout: &mut Layout, region: Region) -> Result<Vec<Region>,
     Ok(all)
 }
 
+/// Eigen-decompositions that a scan's region needs and that need no scan themselves: as a stage before it, and the rest.
+/// An invocation of a scan runs along a whole line. It would decompose one matrix after the other, and again for every
+/// shift; old software drivers (llvmpipe) even stop an invocation for good after 65535 rounds of all its loops.
+pub(super) fn before_scan(layout: &mut Layout, region: Region) -> Result<(Option<Region>, Region), LowerError> {
+    let Some(inner) = region.inner.clone() else { return Ok((None, region)) };
+    let mut scanned = vec![false; region.body.len()];
+    let mut found = vec![];
+    for id in region.ids() {
+        let (at, inst) = (id.0 as usize, region.inst(id));
+        scanned[at] = matches!(inst.op, RegionOp::CumSum { .. } | RegionOp::Shift { .. })
+            || inst.inputs.iter().any(|i| scanned[i.0 as usize]);
+        if matches!(inst.op, RegionOp::SymEig { .. }) && !scanned[at] && inst.axes.contains(&inner) {
+            found.push(id);
+        }
+    }
+    if found.is_empty() {
+        return Ok((None, region));
+    }
+    let mut own = Region { stores: vec![], whole: false, ..region.clone() };
+    let mut rest = region;
+    for value in found {
+        let inst = rest.inst(value);
+        let shape = Shape::of(rest.domain.clone(), inst.channels, inst.dtype);
+        let buffer = layout.scratch(&inst.label, shape)?;
+        own.stores.push(Store::Write { value, buffer });
+        replace_by_load(layout, &mut rest, value, buffer);
+    }
+    Ok((Some(own.swept()), rest.swept()))
+}
+
 fn sums_channels(op: &RegionOp) -> bool {
     matches!(op, RegionOp::ChannelSum(_) | RegionOp::RowLinear { .. } | RegionOp::ChannelMax | RegionOp::SymEig { .. })
 }

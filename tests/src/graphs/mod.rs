@@ -70,6 +70,12 @@ impl Recipe {
         Recipe { seed, sizes, nodes, without: BTreeSet::new(), dropped: BTreeSet::new() }
     }
 
+    /// A graph of the same kind with a third of the nodes: software GPUs take long over every kernel.
+    pub fn few_nodes(seed: u64) -> Recipe {
+        let recipe = Recipe::new(seed);
+        Recipe { nodes: 4 + recipe.nodes / 4, ..recipe }
+    }
+
     pub fn build(&self) -> Graph {
         let mut builder = Builder::new(self);
         for node in 0..self.nodes {
