@@ -103,11 +103,11 @@ fn second_half() {
 }
 
 #[test]
-fn few_nodes_first_half() {
-    check_graphs(&devices(), Recipe::few_nodes, seeds(SMALL, 0));
+fn small_graphs_first_half() {
+    check_graphs(&devices(), Recipe::small, seeds(SMALL, 0));
 }
 
 #[test]
-fn few_nodes_second_half() {
-    check_graphs(&devices(), Recipe::few_nodes, seeds(SMALL, 1));
+fn small_graphs_second_half() {
+    check_graphs(&devices(), Recipe::small, seeds(SMALL, 1));
 }

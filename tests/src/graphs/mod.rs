@@ -22,6 +22,7 @@ use crate::Rng;
 use builder::Builder;
 use raygrad_compiler::Step;
 use raygrad_compiler::reference::Bindings;
+use roots::FIRST_TERM;
 use std::collections::BTreeSet;
 
 /// How to make one random graph.
@@ -70,10 +71,12 @@ impl Recipe {
         Recipe { seed, sizes, nodes, without: BTreeSet::new(), dropped: BTreeSet::new() }
     }
 
-    /// A graph of the same kind with a third of the nodes: software GPUs take long over every kernel.
-    pub fn few_nodes(seed: u64) -> Recipe {
+    /// A graph of the same kind with a third of the nodes and half of the roots: software GPUs take long over every kernel.
+    pub fn small(seed: u64) -> Recipe {
         let recipe = Recipe::new(seed);
-        Recipe { nodes: 4 + recipe.nodes / 4, ..recipe }
+        let mut rng = Rng(seed);
+        let dropped = (0..40).chain(FIRST_TERM..FIRST_TERM + 10).filter(|_| rng.chance(0.5)).collect();
+        Recipe { nodes: 4 + recipe.nodes / 4, dropped, ..recipe }
     }
 
     pub fn build(&self) -> Graph {
