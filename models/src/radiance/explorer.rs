@@ -20,8 +20,6 @@ use std::sync::Arc;
 
 /// Pixels that one run of the rendering program covers, at most.
 const VIEW_PIXELS: usize = 2048;
-/// Points that one run of the density program covers.
-const MESH_POINTS: usize = 4096;
 
 /// A model in training.
 pub struct Explorer {
@@ -31,7 +29,6 @@ pub struct Explorer {
     train: ProgramId,
     view: ProgramId,
     refine: ProgramId,
-    densities: ProgramId,
     /// Pixels of one run of `view`.
     view_pixels: usize,
     rays: usize,
@@ -59,7 +56,6 @@ impl Explorer {
         let train = learner.add(&model.train_step())?;
         let view = learner.add(&model.view(view_pixels))?;
         let refine = learner.add(&model.refinement())?;
-        let densities = learner.add(&model.densities(MESH_POINTS))?;
         learner.fill(&model.parameters(), settings.run.seed)?;
         learner.set_seed(model::SEED, settings.run.seed)?;
         let flat = |rows: Vec<[f64; 12]>| rows.concat().iter().map(|x| *x as f32).collect::<Vec<f32>>();
@@ -70,7 +66,7 @@ impl Explorer {
         let images: Vec<f32> = data.scene.train.iter().flat_map(|v| v.rgb.iter().copied()).collect();
         learner.set(model::IMAGES, &images)?;
         let (rays, flops, settings) = (model.rays_per_view() * views, model.flops(), settings.clone());
-        Ok(Explorer { data, settings, learner, train, view, refine, densities, view_pixels, rays, flops, scores: None })
+        Ok(Explorer { data, settings, learner, train, view, refine, view_pixels, rays, flops, scores: None })
     }
 
     /// The program of a training step.
@@ -81,14 +77,8 @@ impl Explorer {
     /// The poses of the training views, as the last step found them.
     pub fn poses(&mut self) -> Result<Vec<Pose>, Error> {
         let found = self.learner.session.get(model::FOUND)?;
-        Ok(self
-            .data
-            .start
-            .poses
-            .iter()
-            .zip(found.chunks(12))
-            .map(|(rough, found)| rough.after(&Pose::from_rows(found)))
-            .collect())
+        let one = |(rough, found): (&Pose, &[f32])| rough.after(&Pose::from_rows(found));
+        Ok(self.data.start.poses.iter().zip(found.chunks(12)).map(one).collect())
     }
 
     /// The whole image of a camera in the learned world.
@@ -132,20 +122,6 @@ impl Explorer {
         }
         let twist = self.learner.session.get(model::TWIST)?;
         Ok(pose.after(&Pose::exp(&std::array::from_fn(|i| f64::from(twist[i])))))
-    }
-
-    /// Densities at points of the learned world, three numbers a point.
-    pub fn densities(&mut self, points: &[f32]) -> Result<Vec<f32>, Error> {
-        let mut all = vec![];
-        for part in points.chunks(3 * MESH_POINTS) {
-            let mut padded = part.to_vec();
-            padded.resize(3 * MESH_POINTS, 0.0);
-            self.learner.set(model::MESH_POINTS, &padded)?;
-            self.learner.run(self.densities)?;
-            let values = self.learner.read(self.densities, "density")?;
-            all.extend(&values[..part.len() / 3]);
-        }
-        Ok(all)
     }
 
     fn set_view(&mut self, pose: &Pose, intrinsics: &Intrinsics) -> Result<(), Error> {

@@ -60,7 +60,6 @@ const DENSITY: u32 = 4;
 pub struct RadianceModel {
     pub settings: Settings,
     pub size: ImageSize,
-    scene: SceneSettings,
     train: TrainSettings,
     warp: Arc<dyn Warp>,
     field: RadianceField,
@@ -90,13 +89,13 @@ impl RadianceModel {
         views: usize,
         warp: Arc<dyn Warp>,
     ) -> Result<RadianceModel, NotInSpace> {
-        let (scene, train, radiance) = sections(settings)?;
+        let (_, train, radiance) = sections(settings)?;
         let frame = warp.frame().cloned().unwrap_or_else(|| Axis::new("frame", views));
         let pixel = Axis::new("pixel", size.pixels());
         let code = warps::codes(&*warp, &frame);
         let field = RadianceField::new(&settings.field, radiance);
-        let (settings, scene, train) = (settings.clone(), scene.clone(), train.clone());
-        Ok(RadianceModel { settings, size, scene, train, warp, field, frame, pixel, code })
+        let (settings, train) = (settings.clone(), train.clone());
+        Ok(RadianceModel { settings, size, train, warp, field, frame, pixel, code })
     }
 
     /// Everything that is trained.
@@ -209,15 +208,6 @@ impl RadianceModel {
         }
     }
 
-    /// Density at points of space, `points` of them: input `mesh.points`, output `density`.
-    #[track_caller]
-    pub fn densities(&self, points: usize) -> Step {
-        let at = Tensor::data(MESH_POINTS, Shape::new(&[&Axis::new("point", points)], 3));
-        let forward = Tensor::constant(&[0.0, 0.0, 1.0]);
-        let density = self.field.at(&at, &forward, &progress(), None).density;
-        Step { outputs: vec![("density".to_string(), density)], updates: vec![] }
-    }
-
     #[track_caller]
     fn view_rays(&self, point: &Axis, index: &Tensor, pose: &Tensor) -> Rays {
         let intrinsics = Tensor::per_step(VIEW_INTRINSICS, Shape::new(&[], 4));
@@ -273,19 +263,7 @@ impl RadianceModel {
         }
         seen
     }
-
-    /// The noise, poses and sizes of the scene.
-    pub fn scene(&self) -> &SceneSettings {
-        &self.scene
-    }
-
-    pub fn train(&self) -> &TrainSettings {
-        &self.train
-    }
 }
-
-/// Points at which [`RadianceModel::densities`] looks.
-pub const MESH_POINTS: &str = "mesh.points";
 
 /// Initial values of the state [`FOUND`]: nothing found yet.
 pub fn nothing_found(views: usize) -> Vec<f32> {
