@@ -1,10 +1,13 @@
 //! A cache-line-aligned buffer of `f32`.
-use std::alloc::{Layout, alloc_zeroed, dealloc, handle_alloc_error};
+use std::alloc::{Layout, alloc, dealloc, handle_alloc_error};
 use std::ops::{Deref, DerefMut};
 use std::ptr::NonNull;
 
 /// Bytes of a cache line and of the widest vector.
 const ALIGN: usize = 64;
+/// Bytes of a huge page. Buffers of at least half of one are made of them: a tile's channels lie far apart, so that a
+/// layer touches more small pages than the processor remembers the addresses of.
+const HUGE_PAGE: usize = 2 << 20;
 
 /// A zero-initialised, growable `f32` buffer whose first element is 64-byte aligned.
 #[derive(Debug)]
@@ -28,8 +31,15 @@ impl AlignedVec {
         }
         let layout = Self::layout(len);
         // SAFETY: `layout` has a nonzero size because `len > 0`.
-        let raw = unsafe { alloc_zeroed(layout) };
+        let raw = unsafe { alloc(layout) };
         let Some(ptr) = NonNull::new(raw.cast::<f32>()) else { handle_alloc_error(layout) };
+        #[cfg(target_os = "linux")]
+        if layout.align() == HUGE_PAGE {
+            // SAFETY: whole pages of this very allocation; the advice changes no content. It may be declined.
+            unsafe { libc::madvise(raw.cast(), layout.size(), libc::MADV_HUGEPAGE) };
+        }
+        // SAFETY: `len` floats were allocated. After the advice, since the first touch decides the kind of a page.
+        unsafe { ptr.write_bytes(0, len) };
         AlignedVec { ptr, len }
     }
 
@@ -52,7 +62,8 @@ impl AlignedVec {
 
     fn layout(len: usize) -> Layout {
         let bytes = len.checked_mul(size_of::<f32>()).expect("buffer size overflows");
-        Layout::from_size_align(bytes, ALIGN).expect("buffer size overflows")
+        let align = if bytes >= HUGE_PAGE / 2 { HUGE_PAGE } else { ALIGN };
+        Layout::from_size_align(bytes, align).expect("buffer size overflows").pad_to_align()
     }
 }
 
