@@ -1,23 +1,36 @@
 //! Region -> tile program.
 
+use super::fold::fold;
 use super::values::{Values, is_alias};
 use super::*;
 use crate::cpu::{ROW_BLOCK, outer, outer_len, panel_len, row_stride};
-use raygrad_compiler::graph::Axis;
+use raygrad_compiler::graph::{Axes, Axis};
 use raygrad_compiler::plan::Program;
 use raygrad_compiler::plan::region::{Inst, InstId, Region, RegionOp, Store};
 use raygrad_compiler::scalar::{ScalarProgram, Val};
 
 /// Lowers one region of `program`.
-pub fn lower(program: &Program, region: &Region) -> TileProgram {
+pub fn lower(program: &Program, unfolded: &Region) -> TileProgram {
+    let layers = unfolded.body.iter().any(|i| matches!(i.op, RegionOp::Linear(_)))
+        || unfolded.stores.iter().any(|s| matches!(s, Store::Outer { .. }));
+    let most = if layers { LAYER_ROWS } else { PLAIN_ROWS };
+    let (region, lines) = fold(program, unfolded, most);
+    let region = &region;
     let outer: Vec<&Axis> = region.domain.iter().filter(|a| Some(*a) != region.inner.as_ref()).collect();
+    let line = unfolded.inner.as_ref().map_or(1, Axis::size);
     let inner = region.inner.as_ref().map_or(1, Axis::size);
-    let layers = region.body.iter().any(|i| matches!(i.op, RegionOp::Linear(_)))
-        || region.stores.iter().any(|s| matches!(s, Store::Outer { .. }));
-    let rows = tile_rows(inner, region.whole, if layers { LAYER_ROWS } else { PLAIN_ROWS });
+    let rows = tile_rows(inner, line, region.whole, most);
     let ld = row_stride(rows);
-    let mut lowering =
-        Lowering { program, region, outer, values: Values::new(region, ld), out: empty(inner, rows, ld) };
+    let mut lowering = Lowering {
+        program,
+        region,
+        domain: &unfolded.domain,
+        outer,
+        lines,
+        inner: unfolded.inner.as_ref(),
+        values: Values::new(region, ld),
+        out: empty(inner, line, rows, ld),
+    };
     lowering.out.outer = lowering.outer.iter().map(|a| a.size()).collect();
     // A buffer that is updated in place is read before anything is written. Constants are written once for all tiles:
     // their places must never have been another value's. Uniform values are small, and layers want their bias first.
@@ -43,16 +56,21 @@ pub fn lower(program: &Program, region: &Region) -> TileProgram {
     lowering.finish()
 }
 
-/// Rows of a tile: the inner axis in equal parts, none longer than `most`.
-fn tile_rows(inner: usize, whole: bool, most: usize) -> usize {
+/// Rows of a tile: all rows in equal parts, none longer than `most`; whole lines, if there are several.
+fn tile_rows(inner: usize, line: usize, whole: bool, most: usize) -> usize {
+    if line < inner {
+        let lines = inner / line;
+        return lines.div_ceil(lines.div_ceil(most / line)) * line;
+    }
     let segments = if whole { 1 } else { inner.div_ceil(most) };
     inner.div_ceil(segments).next_multiple_of(ROW_BLOCK)
 }
 
-fn empty(inner: usize, rows: usize, ld: usize) -> TileProgram {
+fn empty(inner: usize, line: usize, rows: usize, ld: usize) -> TileProgram {
     TileProgram {
         outer: vec![],
         inner,
+        line,
         rows,
         ld,
         scratch: 0,
@@ -79,7 +97,12 @@ struct FusedLayer {
 struct Lowering<'a> {
     program: &'a Program,
     region: &'a Region,
+    /// Of the region before it was folded.
+    domain: &'a Axes,
     outer: Vec<&'a Axis>,
+    /// Axes whose positions are lines, outermost first, and the axis that lines run along.
+    lines: Vec<Axis>,
+    inner: Option<&'a Axis>,
     values: Values,
     out: TileProgram,
 }
@@ -87,16 +110,17 @@ struct Lowering<'a> {
 impl Lowering<'_> {
     fn view(&self, buffer: BufferId) -> View {
         let shape = &self.program.buffer(buffer).shape;
-        let strides = shape.axes.strides_in(&self.region.domain);
+        let strides = shape.axes.strides_in(self.domain);
         let stride = |axis: &Axis| {
-            let at = self.region.domain.iter().position(|a| a == axis);
+            let at = self.domain.iter().position(|a| a == axis);
             at.map_or(0, |i| strides[i])
         };
         View {
             buffer,
             elements: shape.axes.elements(),
             outer: self.outer.iter().map(|a| stride(a)).collect(),
-            inner: self.region.inner.as_ref().map_or(0, stride),
+            lines: self.lines.iter().map(|a| (a.size(), stride(a))).collect(),
+            inner: self.inner.map_or(0, stride),
         }
     }
 
@@ -104,6 +128,21 @@ impl Lowering<'_> {
     fn axis_stride(&self, buffer: BufferId, axis: &Axis) -> (usize, usize) {
         let axes = &self.program.buffer(buffer).shape.axes;
         (axes.iter().skip_while(|a| *a != axis).skip(1).map(Axis::size).product(), axis.size())
+    }
+
+    /// Where the position along `axis` comes from.
+    fn position(&self, axis: &Axis) -> Position {
+        if let Some(outer) = self.outer.iter().position(|a| *a == axis) {
+            return Position::Outer(outer);
+        }
+        let mut every = 1;
+        for row in self.lines.iter().chain(self.inner).rev() {
+            if row == axis {
+                break;
+            }
+            every *= row.size();
+        }
+        Position::Row { every, size: axis.size() }
     }
 
     fn places(&self, id: InstId) -> Vec<Place> {
@@ -186,13 +225,13 @@ impl Lowering<'_> {
             }
             RegionOp::RowReduce(kind) => {
                 let x = self.values.get(inst.inputs[0]).clone();
-                let out = self.values.create(id, inst.channels, false);
-                self.out.ops.push(TileOp::RowReduce { kind: *kind, x, out });
+                let out = self.values.create(id, inst.channels, full);
+                self.out.ops.push(TileOp::RowReduce { kind: *kind, x, out, full });
             }
             RegionOp::Index(axis) => {
-                let outer = self.outer.iter().position(|a| *a == axis);
+                let of = self.position(axis);
                 let out = self.values.create(id, 1, full);
-                self.out.ops.push(TileOp::Index { outer, out });
+                self.out.ops.push(TileOp::Index { of, out });
             }
             RegionOp::Take { table, axis } => {
                 let index = self.values.get(inst.inputs[0]).clone();
@@ -201,7 +240,10 @@ impl Lowering<'_> {
                 for (stride, outer) in view.outer.iter_mut().zip(&self.outer) {
                     *stride = if *outer == axis { 0 } else { *stride };
                 }
-                if region.inner.as_ref() == Some(axis) {
+                for ((_, stride), line) in view.lines.iter_mut().zip(&self.lines) {
+                    *stride = if line == axis { 0 } else { *stride };
+                }
+                if self.inner == Some(axis) {
                     view.inner = 0;
                 }
                 let (axis_stride, axis_size) = self.axis_stride(*table, axis);
@@ -464,14 +506,16 @@ impl Lowering<'_> {
         let temps = temps.max().unwrap_or(0) * BLOCK + self.out.ld.max(BLOCK);
         self.out.temps = self.values.arena_len();
         self.out.scratch = self.out.temps + temps;
-        let per_outer = |op: &TileOp| match op {
-            TileOp::Store(TileStore::Reduce { view, .. }) => view.inner == 0 && view.outer.iter().all(|s| *s > 0),
+        let per_line = |op: &TileOp| match op {
+            TileOp::Store(TileStore::Reduce { view, .. }) => {
+                view.inner == 0 && view.outer.iter().chain(view.lines.iter().map(|(_, s)| s)).all(|s| *s > 0)
+            }
             TileOp::Store(TileStore::Outer { .. } | TileStore::Scatter { .. }) => false,
             _ => true,
         };
-        let positions = self.out.outer.iter().product::<usize>();
-        self.out.direct = positions >= 2 * MAX_CHUNKS && self.out.ops.iter().all(per_outer);
-        let units = if self.out.direct { positions } else { self.out.tiles() }.max(1);
+        let complete = self.out.tiles() / self.out.line_tiles();
+        self.out.direct = complete >= 2 * MAX_CHUNKS && self.out.ops.iter().all(per_line);
+        let units = if self.out.direct { complete } else { self.out.tiles() }.max(1);
         // A chunk's accumulators are worth a few tiles of work each.
         self.out.chunks = (units / CHUNK_TILES).next_power_of_two().clamp(units.min(2), MAX_CHUNKS);
         self.out

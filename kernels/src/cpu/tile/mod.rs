@@ -1,12 +1,13 @@
 //! CPU tile programs: a region lowered to calls of the SIMD kernels.
 //!
-//! A tile is a stretch of the region's inner axis at one position of the outer axes. Every value of the region lives in
-//! a scratch arena that stays in the L2 cache: *full* values channel by channel with one lane a row, *uniform* values
-//! (which do not vary along the inner axis) one lane a channel. Picking channels costs nothing: a value is a list of
+//! A tile is a stretch of the region's inner axis at one position of the outer axes, or several whole *lines* along it
+//! (`fold`). Every value of the region lives in a scratch arena that stays in the L2 cache: *full* values channel by
+//! channel with one lane a row, *uniform* values (which do not vary over the rows) one lane a channel. Picking channels costs nothing: a value is a list of
 //! places, and picks share them.
 
 mod allocate;
 mod flat;
+mod fold;
 mod lower;
 mod run;
 mod values;
@@ -32,7 +33,8 @@ const WIDE: usize = 64;
 /// Lanes that a pointwise program works on at a time: its temporaries stay in L1.
 const BLOCK: usize = 512;
 
-/// How a buffer is addressed from a position of the domain: `channel * elements + outer . index + inner * row`.
+/// How a buffer is addressed from a position of the domain: `channel * elements + outer . index + lines . index of the
+/// line + inner * row of the line`.
 #[derive(Clone, Debug)]
 pub struct View {
     pub buffer: BufferId,
@@ -40,8 +42,29 @@ pub struct View {
     pub elements: usize,
     /// Stride of every outer axis.
     pub outer: Vec<usize>,
+    /// Size and stride of every axis whose positions are lines, outermost first.
+    pub lines: Vec<(usize, usize)>,
     /// Stride of the inner axis; 0 where the buffer lacks it.
     pub inner: usize,
+}
+
+impl View {
+    /// Lane of channel 0 at a row, of rows in lines of `line`.
+    fn lane(&self, position: &[usize], row: usize, line: usize) -> usize {
+        let mut lane = position.iter().zip(&self.outer).map(|(p, s)| p * s).sum::<usize>() + row % line * self.inner;
+        let mut index = row / line;
+        for (size, stride) in self.lines.iter().rev() {
+            lane += index % size * stride;
+            index /= size;
+        }
+        lane
+    }
+
+    /// Whether lanes are evenly spaced from line to line too.
+    fn is_even(&self, line: usize) -> bool {
+        let mut next = line * self.inner;
+        self.lines.iter().rev().all(|(size, stride)| std::mem::replace(&mut next, size * stride) == *stride)
+    }
 }
 
 /// Where a channel of a value starts in the scratch arena, in lanes.
@@ -172,15 +195,16 @@ pub enum TileOp {
         out: Place,
         by: i64,
     },
-    /// Reduction over the tile's rows, one lane a channel.
+    /// Reduction over the rows of each line: one lane a channel, or the same for all rows of a line.
     RowReduce {
         kind: Reduction,
         x: Value,
         out: Place,
+        full: bool,
     },
-    /// Position along an outer axis (by index) or the inner one.
+    /// Position along an axis.
     Index {
-        outer: Option<usize>,
+        of: Position,
         out: Place,
     },
     Take {
@@ -199,6 +223,15 @@ pub enum TileOp {
         full: bool,
     },
     Store(TileStore),
+}
+
+/// A position along an axis of the domain.
+#[derive(Clone, Copy, Debug)]
+pub enum Position {
+    /// Along an outer axis, by index.
+    Outer(usize),
+    /// `row / every % size`.
+    Row { every: usize, size: usize },
 }
 
 /// How a tile's result reaches memory.
@@ -262,9 +295,11 @@ pub struct Pack {
 pub struct TileProgram {
     /// Sizes of the outer axes.
     pub outer: Vec<usize>,
-    /// Size of the inner axis.
+    /// Rows at a position of the outer axes: the size of the inner axis, times the lines.
     pub inner: usize,
-    /// Most rows of a tile, a multiple of [`super::ROW_BLOCK`].
+    /// Rows of a line: the size of the inner axis.
+    pub line: usize,
+    /// Most rows of a tile: whole lines, if there are several.
     pub rows: usize,
     /// Lanes between channels of a full value.
     pub ld: usize,
@@ -280,7 +315,7 @@ pub struct TileProgram {
     pub accumulators: Vec<Accumulator>,
     /// Lanes of one chunk's accumulators.
     pub accumulated: usize,
-    /// Reductions over the inner axis alone go straight to their buffer: chunks end where an outer position ends.
+    /// Reductions over the inner axis alone go straight to their buffer: chunks end where a line ends.
     pub direct: bool,
     pub chunks: usize,
 }
@@ -294,9 +329,13 @@ impl TileProgram {
     pub fn tiles(&self) -> usize {
         self.outer.iter().product::<usize>() * self.segments()
     }
+    /// Tiles that complete the lines they touch.
+    pub fn line_tiles(&self) -> usize {
+        if self.line < self.inner { 1 } else { self.segments() }
+    }
     /// Tiles of chunk `c`.
     pub fn chunk_tiles(&self, c: usize) -> std::ops::Range<usize> {
-        let unit = if self.direct { self.segments() } else { 1 };
+        let unit = if self.direct { self.line_tiles() } else { 1 };
         let units = self.tiles() / unit;
         c * units / self.chunks * unit..(c + 1) * units / self.chunks * unit
     }

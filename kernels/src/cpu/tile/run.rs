@@ -3,6 +3,7 @@
 use super::*;
 use crate::cpu::{Epilogue, Gemm, Isa, Operand, ROW_BLOCK, apply, gemm, outer, pack_panels, rows_max, rows_sum};
 use raygrad_compiler::ops::sym_eig::jacobi;
+use std::ops::Range;
 
 /// Base addresses of a program's buffers, by [`BufferId`].
 #[derive(Clone, Copy)]
@@ -109,13 +110,26 @@ impl Tile<'_> {
         self.scratch.wrapping_add(place as usize)
     }
 
-    /// Lane of a buffer at the tile's first row, channel 0.
-    fn offset(&self, view: &View) -> usize {
-        self.position.iter().zip(&view.outer).map(|(p, s)| p * s).sum::<usize>() + self.row0 * view.inner
+    /// The tile's lines: first row and rows of each.
+    fn lines(&self, line: usize) -> impl Iterator<Item = (usize, usize)> + use<> {
+        let rows = self.rows;
+        (0..rows).step_by(line).map(move |first| (first, line.min(rows - first)))
     }
 
-    fn base(&self, view: &View) -> *mut f32 {
-        self.memory.buffers[view.buffer.0 as usize].wrapping_add(self.offset(view))
+    /// Stretches of rows along which the lanes of `view` are evenly spaced: first row, rows, lane of the first.
+    fn runs(&self, view: &View) -> impl Iterator<Item = (usize, usize, usize)> {
+        let line = self.program.line;
+        let lines = self.lines(if view.is_even(line) { self.rows } else { line });
+        lines.map(move |(first, rows)| (first, rows, view.lane(self.position, self.row0 + first, line)))
+    }
+
+    /// Index along the outer axes of an operand that does not vary over rows.
+    fn element(&self, view: &View) -> usize {
+        self.position.iter().zip(&view.outer).map(|(p, s)| p * s).sum()
+    }
+
+    fn buffer(&self, view: &View) -> *mut f32 {
+        self.memory.buffers[view.buffer.0 as usize]
     }
 
     /// Lanes an operation works on, and the distance between output channels.
@@ -173,34 +187,20 @@ impl Tile<'_> {
                 }
                 TileOp::CumSum { from, out, reverse } => self.cumsum(from, *out, *reverse),
                 TileOp::Shift { from, out, by } => self.shift(from, *out, *by),
-                TileOp::RowReduce { kind, x, out } => {
-                    for c in 0..x.places.len() {
-                        *self.at(*out).add(c) = self.total(*kind, x, c);
-                    }
-                }
-                TileOp::Index { outer, out } => {
+                TileOp::RowReduce { kind, x, out, full } => self.row_reduce(*kind, x, *out, *full),
+                TileOp::Index { of, out } => {
                     let out = self.at(*out);
-                    match outer {
-                        Some(axis) => *out = f32::from_bits(self.position[*axis] as u32),
-                        None => {
+                    match *of {
+                        Position::Outer(axis) => *out = f32::from_bits(self.position[axis] as u32),
+                        Position::Row { every, size } => {
                             for r in 0..self.padded {
-                                *out.add(r) = f32::from_bits((self.row0 + r) as u32);
+                                *out.add(r) = f32::from_bits(((self.row0 + r) / every % size) as u32);
                             }
                         }
                     }
                 }
                 TileOp::Take { view, axis_stride, axis_size, index, out, channels, full } => {
-                    let (_, step) = self.extent(*full);
-                    let rows = if *full { self.rows } else { 1 };
-                    let base = self.base(view);
-                    for r in 0..self.extent(*full).0 {
-                        let slot = (self.lane(index, 0, r).to_bits() as usize).min(axis_size - 1);
-                        // Padding rows repeat the last one: they only have to stay inside the buffer.
-                        let from = base.add(slot * axis_stride + r.min(rows - 1) * view.inner);
-                        for c in 0..*channels {
-                            *self.at(*out).add(c * step + r) = *from.add(c * view.elements);
-                        }
-                    }
+                    self.take(view, (*axis_stride, *axis_size), index, *out, *channels, *full);
                 }
                 TileOp::SymEig { n, from, out, full } => self.sym_eig(*n, from, *out, *full),
                 TileOp::Store(store) => self.store(store),
@@ -220,21 +220,67 @@ impl Tile<'_> {
     }
 
     unsafe fn load(&self, view: &View, to: Place, channels: usize, full: bool) {
-        let (len, step) = self.extent(full);
-        let rows = if full { self.rows } else { 1 };
-        let base = self.base(view);
-        for c in 0..channels {
-            // SAFETY: rows `row0..row0 + rows` are inside the buffer; padding rows are set, not read.
-            unsafe {
-                let (from, to) = (base.add(c * view.elements), self.at(to).add(c * step));
-                if rows == 1 || view.inner == 1 {
-                    std::ptr::copy_nonoverlapping(from, to, rows);
-                } else {
-                    for r in 0..rows {
-                        *to.add(r) = *from.add(r * view.inner);
+        if !full {
+            let from = self.buffer(view).wrapping_add(self.element(view));
+            for c in 0..channels {
+                // SAFETY: a lane of every channel of the buffer.
+                unsafe { *self.at(to).add(c) = *from.add(c * view.elements) };
+            }
+            return;
+        }
+        for (first, rows, lane) in self.runs(view) {
+            for c in 0..channels {
+                // SAFETY: rows of the tile are inside the buffer.
+                unsafe {
+                    let from = self.buffer(view).add(lane + c * view.elements);
+                    let to = self.at(to).add(c * self.program.ld + first);
+                    match view.inner {
+                        0 => std::slice::from_raw_parts_mut(to, rows).fill(*from),
+                        1 => std::ptr::copy_nonoverlapping(from, to, rows),
+                        step => (0..rows).for_each(|r| *to.add(r) = *from.add(r * step)),
                     }
                 }
-                std::slice::from_raw_parts_mut(to.add(rows), len - rows).fill(0.0);
+            }
+        }
+        for c in 0..channels {
+            let padding = self.at(to).wrapping_add(c * self.program.ld + self.rows);
+            // SAFETY: padding rows are set, not read.
+            unsafe { std::slice::from_raw_parts_mut(padding, self.padded - self.rows).fill(0.0) };
+        }
+    }
+
+    unsafe fn take(
+        &self,
+        view: &View,
+        (axis_stride, axis_size): (usize, usize),
+        index: &Value,
+        out: Place,
+        channels: usize,
+        full: bool,
+    ) {
+        let (len, step) = self.extent(full);
+        let copy = |row: usize, lane: usize| {
+            // SAFETY: the slot is inside the axis, and the lane without it inside the buffer.
+            unsafe {
+                let slot = (self.lane(index, 0, row).to_bits() as usize).min(axis_size - 1);
+                let from = self.buffer(view).add(lane + slot * axis_stride);
+                for c in 0..channels {
+                    *self.at(out).add(c * step + row) = *from.add(c * view.elements);
+                }
+            }
+        };
+        if !full {
+            return copy(0, self.element(view));
+        }
+        for (first, rows, lane) in self.runs(view) {
+            (0..rows).for_each(|r| copy(first + r, lane + r * view.inner));
+        }
+        for c in 0..channels {
+            let channel = self.at(out).wrapping_add(c * step);
+            // SAFETY: rows of a full channel; padding rows repeat the last one.
+            unsafe {
+                let last = *channel.add(self.rows - 1);
+                std::slice::from_raw_parts_mut(channel.add(self.rows), len - self.rows).fill(last);
             }
         }
     }
@@ -291,8 +337,7 @@ impl Tile<'_> {
     unsafe fn layer(&self, layer: &Layer) {
         let Layer { x, contraction, pack, bias, accumulate, epilogue, out, outputs, full } = *layer;
         let pack = &self.program.packs[pack];
-        let element: usize = self.position.iter().zip(&pack.view.outer).map(|(p, s)| p * s).sum();
-        let panels = self.packed.wrapping_add(pack.at + element * pack.len);
+        let panels = self.packed.wrapping_add(pack.at + self.element(&pack.view) * pack.len);
         if !full {
             // One row: a dot product per output, straight from the panels.
             for o in 0..outputs {
@@ -356,13 +401,15 @@ impl Tile<'_> {
     unsafe fn cumsum(&self, from: &[Place], out: Place, reverse: bool) {
         for (c, place) in from.iter().enumerate() {
             let (x, y) = (self.at(*place), self.at(out).wrapping_add(c * self.program.ld));
-            let mut sum = 0.0f32;
-            for i in 0..self.rows {
-                let r = if reverse { self.rows - 1 - i } else { i };
-                // SAFETY: rows of a full channel.
-                unsafe {
-                    *y.add(r) = sum;
-                    sum += *x.add(r);
+            for (first, rows) in self.lines(self.program.line) {
+                let mut sum = 0.0f32;
+                for i in 0..rows {
+                    let r = first + if reverse { rows - 1 - i } else { i };
+                    // SAFETY: rows of a full channel.
+                    unsafe {
+                        *y.add(r) = sum;
+                        sum += *x.add(r);
+                    }
                 }
             }
             // SAFETY: padding rows of the same channel.
@@ -373,12 +420,36 @@ impl Tile<'_> {
     unsafe fn shift(&self, from: &[Place], out: Place, by: i64) {
         for (c, place) in from.iter().enumerate() {
             let (x, y) = (self.at(*place), self.at(out).wrapping_add(c * self.program.ld));
-            for r in 0..self.padded {
-                let source = r as i64 - by;
-                let inside = (0..self.rows as i64).contains(&source) && r < self.rows;
-                // SAFETY: rows of a full channel.
-                unsafe { *y.add(r) = if inside { *x.add(source as usize) } else { 0.0 } };
+            for (first, rows) in self.lines(self.program.line) {
+                for r in 0..rows {
+                    let source = r as i64 - by;
+                    let inside = (0..rows as i64).contains(&source);
+                    // SAFETY: rows of a full channel.
+                    unsafe { *y.add(first + r) = if inside { *x.add(first + source as usize) } else { 0.0 } };
+                }
             }
+            // SAFETY: padding rows of the same channel.
+            unsafe { std::slice::from_raw_parts_mut(y.add(self.rows), self.padded - self.rows).fill(0.0) };
+        }
+    }
+
+    unsafe fn row_reduce(&self, kind: Reduction, x: &Value, out: Place, full: bool) {
+        for c in 0..x.places.len() {
+            if !full {
+                // SAFETY: the output has one lane a channel.
+                unsafe { *self.at(out).add(c) = self.total(kind, x, c, 0..self.rows) };
+                continue;
+            }
+            let out = self.at(out).wrapping_add(c * self.program.ld);
+            for (first, rows) in self.lines(self.program.line) {
+                // SAFETY: rows of a full channel.
+                unsafe {
+                    let total = self.total(kind, x, c, first..first + rows);
+                    std::slice::from_raw_parts_mut(out.add(first), rows).fill(total);
+                }
+            }
+            // SAFETY: padding rows of the same channel.
+            unsafe { std::slice::from_raw_parts_mut(out.add(self.rows), self.padded - self.rows).fill(0.0) };
         }
     }
 
@@ -400,7 +471,7 @@ impl Tile<'_> {
         }
     }
 
-    /// Accumulator of a store: the chunk's own, or the buffer itself where chunks end at outer positions.
+    /// Accumulator of a store: the chunk's own, or the buffer itself where chunks end with lines.
     fn accumulator(&self, view: &View, at: usize) -> *mut f32 {
         if self.program.direct {
             self.memory.buffers[view.buffer.0 as usize]
@@ -414,18 +485,13 @@ impl Tile<'_> {
         unsafe {
             match store {
                 TileStore::Write { value, view } => {
-                    let base = self.base(view);
-                    for c in 0..value.places.len() {
-                        let to = base.add(c * view.elements);
-                        if self.program.inner == 1 || !value.full {
-                            for r in 0..self.rows {
-                                *to.add(r * view.inner) = self.lane(value, c, r);
-                            }
-                        } else if view.inner == 1 {
-                            std::ptr::copy_nonoverlapping(self.at(value.places[c]), to, self.rows);
-                        } else {
-                            for r in 0..self.rows {
-                                *to.add(r * view.inner) = self.lane(value, c, r);
+                    for (first, rows, lane) in self.runs(view) {
+                        for c in 0..value.places.len() {
+                            let to = self.buffer(view).add(lane + c * view.elements);
+                            if value.full && view.inner == 1 {
+                                std::ptr::copy_nonoverlapping(self.at(value.places[c]).add(first), to, rows);
+                            } else {
+                                (0..rows).for_each(|r| *to.add(r * view.inner) = self.lane(value, c, first + r));
                             }
                         }
                     }
@@ -434,8 +500,7 @@ impl Tile<'_> {
                 TileStore::Outer { parts, k, d, n, view, at } => {
                     let ld = self.program.ld;
                     let rows = self.rows.next_multiple_of(crate::cpu::outer::ROWS);
-                    let element: usize = self.position.iter().zip(&view.outer).map(|(p, s)| p * s).sum();
-                    let g = self.accumulators.add(at + element * crate::cpu::outer_len(*k, *n));
+                    let g = self.accumulators.add(at + self.element(view) * crate::cpu::outer_len(*k, *n));
                     self.clear_padding(*d, *n, rows);
                     for (x, first, channels) in parts {
                         self.clear_padding(*x, *channels, rows);
@@ -455,12 +520,14 @@ impl Tile<'_> {
                     }
                 }
                 TileStore::Scatter { value, index, axis_stride, axis_size, view, at } => {
-                    let base = self.accumulators.add(at + self.offset(view));
-                    for r in 0..self.rows {
-                        let slot = (self.lane(index, 0, r).to_bits() as usize).min(axis_size - 1);
-                        let to = base.add(slot * axis_stride + r * view.inner);
-                        for c in 0..value.places.len() {
-                            *to.add(c * view.elements) += self.lane(value, c, r);
+                    for (first, rows, lane) in self.runs(view) {
+                        let base = self.accumulators.add(at + lane);
+                        for r in 0..rows {
+                            let slot = (self.lane(index, 0, first + r).to_bits() as usize).min(axis_size - 1);
+                            let to = base.add(slot * axis_stride + r * view.inner);
+                            for c in 0..value.places.len() {
+                                *to.add(c * view.elements) += self.lane(value, c, first + r);
+                            }
                         }
                     }
                 }
@@ -478,7 +545,7 @@ impl Tile<'_> {
     }
 
     unsafe fn reduce(&self, kind: Reduction, value: &Value, view: &View, at: usize) {
-        let base = self.accumulator(view, at).wrapping_add(self.offset(view));
+        let base = self.accumulator(view, at);
         let combine = |to: *mut f32, x: f32| {
             // SAFETY: a lane of this chunk's accumulator.
             unsafe {
@@ -490,43 +557,46 @@ impl Tile<'_> {
         };
         let ld = self.program.ld;
         let side_by_side = value.places.windows(2).all(|w| w[1] == w[0] + ld as Place);
-        if view.inner == 0 && view.elements == 1 && value.full && side_by_side && kind == Reduction::Sum {
-            let x = self.at(value.places[0]);
-            // SAFETY: all channels at once: `rows` lanes each, `ld` apart, and as many accumulator lanes.
-            return unsafe { rows_sum(self.isa, x, ld, value.places.len(), self.rows, base) };
-        }
-        for c in 0..value.places.len() {
-            let to = base.wrapping_add(c * view.elements);
-            // SAFETY: `rows` lanes of a channel in the scratch.
-            unsafe {
-                if view.inner > 0 {
-                    for r in 0..self.rows {
-                        combine(to.add(r * view.inner), self.lane(value, c, r));
+        let at_once = view.inner == 0 && view.elements == 1 && value.full && side_by_side && kind == Reduction::Sum;
+        for (first, rows, lane) in self.runs(view) {
+            let base = base.wrapping_add(lane);
+            if at_once {
+                let x = self.at(value.places[0]).wrapping_add(first);
+                // SAFETY: all channels at once: `rows` lanes each, `ld` apart, and as many accumulator lanes.
+                unsafe { rows_sum(self.isa, x, ld, value.places.len(), rows, base) };
+                continue;
+            }
+            for c in 0..value.places.len() {
+                let to = base.wrapping_add(c * view.elements);
+                // SAFETY: `rows` lanes of a channel in the scratch.
+                unsafe {
+                    if view.inner > 0 {
+                        (0..rows).for_each(|r| combine(to.add(r * view.inner), self.lane(value, c, first + r)));
+                    } else {
+                        combine(to, self.total(kind, value, c, first..first + rows));
                     }
-                } else {
-                    combine(to, self.total(kind, value, c));
                 }
             }
         }
     }
 
-    /// Reduction of a channel over the tile's rows; a uniform one counts for every row.
-    unsafe fn total(&self, kind: Reduction, value: &Value, channel: usize) -> f32 {
-        let (x, ld) = (self.at(value.places[channel]), self.program.ld);
-        // SAFETY: `rows` lanes of a channel in the scratch, or the one of a uniform value.
+    /// Reduction of a channel over some of the tile's rows; a uniform one counts for every row.
+    unsafe fn total(&self, kind: Reduction, value: &Value, channel: usize, rows: Range<usize>) -> f32 {
+        let (x, ld, len) = (self.at(value.places[channel]), self.program.ld, rows.len());
+        // SAFETY: rows of a channel in the scratch, or the one lane of a uniform value.
         unsafe {
             match kind {
                 Reduction::Sum if value.full => {
                     let mut total = 0.0;
-                    rows_sum(self.isa, x, ld, 1, self.rows, &mut total);
+                    rows_sum(self.isa, x.add(rows.start), ld, 1, len, &mut total);
                     total
                 }
                 Reduction::Max if value.full => {
                     let mut total = f32::NEG_INFINITY;
-                    rows_max(self.isa, x, ld, 1, self.rows, &mut total);
+                    rows_max(self.isa, x.add(rows.start), ld, 1, len, &mut total);
                     total
                 }
-                Reduction::Sum => *x * self.rows as f32,
+                Reduction::Sum => *x * len as f32,
                 Reduction::Max => *x,
             }
         }
