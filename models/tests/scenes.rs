@@ -109,7 +109,7 @@ fn sizes_and_counts() {
     });
     made.refused(&all(), &["r_7.png", "12 x 9", "12 x 12", "set a size"]);
     let scene = load(&made.root, &LoadOptions { size: Some([6, 8]), ..all() }, &|_, _| ()).unwrap();
-    assert!(scene.train.iter().all(|v| v.rgb.len() == 6 * 8 * 3));
+    assert!(scene.train.iter().all(|v| v.pixels.len() == 6 * 8));
     let made = Made::transforms();
     made.change("transforms.json", |j| j["frames"].as_array_mut().unwrap().truncate(9));
     made.refused(&all(), &["has 9 images", "10 are needed"]);

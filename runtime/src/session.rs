@@ -7,6 +7,7 @@ use raygrad_compiler::graph::Shape;
 use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::plan::region::BufferId;
 use raygrad_compiler::scalar::DType;
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -14,7 +15,8 @@ use std::sync::Arc;
 pub(crate) trait Executor: Send {
     /// Loads a program; inputs it shares by name with earlier ones share their buffers. New inputs are zero.
     fn add(&mut self, program: Arc<Program>) -> Result<usize, RunError>;
-    fn set(&mut self, input: &str, lanes: &[u32]) -> Result<(), RunError>;
+    /// Sets the lanes of an input from lane `first` on.
+    fn set(&mut self, input: &str, first: usize, lanes: &[u32]) -> Result<(), RunError>;
     fn get(&mut self, input: &str) -> Result<Vec<u32>, RunError>;
     /// Runs a program once; need not wait for it.
     fn run(&mut self, program: usize) -> Result<(), RunError>;
@@ -94,7 +96,22 @@ impl Session {
             let (expected, found) = (shape.lanes(), values.len());
             return Err(RunError::Length { name: name.into(), shape: shape.clone(), expected, found });
         }
-        self.executor.set(name, &to_channel_major(values, shape))
+        self.executor.set(name, 0, &to_channel_major(values, shape))
+    }
+
+    /// Sets some elements of an integer input of one channel, from element `first` on.
+    pub fn set_u32_from(&mut self, name: &str, first: usize, values: &[u32]) -> Result<(), RunError> {
+        let info = self.inputs.get(name).ok_or_else(|| RunError::UnknownInput(name.into()))?;
+        let shape = &info.shape;
+        let lanes = shape.lanes();
+        if shape.dtype != DType::U32 || shape.channels.count() != 1 {
+            return Err(RunError::Type { name: name.into(), shape: shape.clone(), found: "u32, one channel" });
+        }
+        if first.checked_add(values.len()).is_none_or(|end| end > lanes) {
+            let (expected, found) = (lanes.saturating_sub(first), values.len());
+            return Err(RunError::Length { name: name.into(), shape: shape.clone(), expected, found });
+        }
+        self.executor.set(name, first, values)
     }
 
     /// The current value of a float input, in host order; waits for the device.
@@ -106,7 +123,7 @@ impl Session {
     pub fn get_lanes(&mut self, name: &str) -> Result<Vec<u32>, RunError> {
         let info = self.inputs.get(name).ok_or_else(|| RunError::UnknownInput(name.into()))?;
         let lanes = self.executor.get(name)?;
-        Ok(to_host(&lanes, &info.shape))
+        Ok(to_host(lanes, &info.shape))
     }
 
     /// Runs a program once. On a GPU this only submits.
@@ -126,7 +143,7 @@ impl Session {
         let (_, buffer) = found.ok_or_else(|| RunError::UnknownOutput(output.into()))?;
         let shape = plan.buffer(*buffer).shape.clone();
         let lanes = self.executor.output(program.0, *buffer)?;
-        Ok(to_host(&lanes, &shape))
+        Ok(to_host(lanes, &shape))
     }
 
     /// A loaded program.
@@ -141,21 +158,24 @@ fn same_layout(a: &Shape, b: &Shape) -> bool {
     axes(a) == axes(b) && a.channels == b.channels && a.dtype == b.dtype
 }
 
-fn to_channel_major(values: &[u32], shape: &Shape) -> Vec<u32> {
+fn to_channel_major<'a>(values: &'a [u32], shape: &Shape) -> Cow<'a, [u32]> {
     transpose(values, shape.axes.elements(), shape.channels.count())
 }
 
-fn to_host(lanes: &[u32], shape: &Shape) -> Vec<u32> {
-    transpose(lanes, shape.channels.count(), shape.axes.elements())
+fn to_host(lanes: Vec<u32>, shape: &Shape) -> Vec<u32> {
+    match transpose(&lanes, shape.channels.count(), shape.axes.elements()) {
+        Cow::Borrowed(_) => lanes,
+        Cow::Owned(turned) => turned,
+    }
 }
 
-fn transpose(values: &[u32], rows: usize, columns: usize) -> Vec<u32> {
+fn transpose(values: &[u32], rows: usize, columns: usize) -> Cow<'_, [u32]> {
     if rows == 1 || columns == 1 {
-        return values.to_vec();
+        return Cow::Borrowed(values);
     }
     let mut out = Vec::with_capacity(values.len());
     for c in 0..columns {
         out.extend((0..rows).map(|r| values[r * columns + c]));
     }
-    out
+    Cow::Owned(out)
 }

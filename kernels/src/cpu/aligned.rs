@@ -1,5 +1,5 @@
 //! A cache-line-aligned buffer of `f32`.
-use std::alloc::{Layout, alloc, dealloc, handle_alloc_error};
+use std::alloc::{Layout, alloc_zeroed, dealloc, handle_alloc_error};
 use std::ops::{Deref, DerefMut};
 use std::ptr::NonNull;
 
@@ -9,10 +9,14 @@ const ALIGN: usize = 64;
 /// layer touches more small pages than the processor remembers the addresses of.
 const HUGE_PAGE: usize = 2 << 20;
 
-/// A zero-initialised, growable `f32` buffer whose first element is 64-byte aligned.
+/// A zero-initialised, growable `f32` buffer whose first element is 64-byte aligned. Pages of a large one take no memory
+/// before they are written.
 #[derive(Debug)]
 pub struct AlignedVec {
-    /// Start of an allocation of `layout(len)`, or dangling when `len == 0`.
+    /// An allocation of `layout(len)`, or dangling when `len == 0`. It is not aligned: the allocator hands out untouched
+    /// pages only where nothing is asked of their address.
+    base: NonNull<u8>,
+    /// The first aligned address inside.
     ptr: NonNull<f32>,
     len: usize,
 }
@@ -27,20 +31,22 @@ impl AlignedVec {
     /// A buffer of `len` zeros.
     pub fn zeroed(len: usize) -> AlignedVec {
         if len == 0 {
-            return AlignedVec { ptr: NonNull::dangling(), len };
+            return AlignedVec { base: NonNull::dangling(), ptr: NonNull::dangling(), len };
         }
         let layout = Self::layout(len);
         // SAFETY: `layout` has a nonzero size because `len > 0`.
-        let raw = unsafe { alloc(layout) };
-        let Some(ptr) = NonNull::new(raw.cast::<f32>()) else { handle_alloc_error(layout) };
+        let raw = unsafe { alloc_zeroed(layout) };
+        let Some(base) = NonNull::new(raw) else { handle_alloc_error(layout) };
+        let align = Self::align(len);
+        // SAFETY: less than `align` bytes on, of which the allocation has so many more than `len` floats.
+        let ptr = unsafe { base.add(base.addr().get().next_multiple_of(align) - base.addr().get()) };
         #[cfg(target_os = "linux")]
-        if layout.align() == HUGE_PAGE {
+        if align == HUGE_PAGE {
+            let bytes = (len * size_of::<f32>()).next_multiple_of(HUGE_PAGE);
             // SAFETY: whole pages of this very allocation; the advice changes no content. It may be declined.
-            unsafe { libc::madvise(raw.cast(), layout.size(), libc::MADV_HUGEPAGE) };
+            unsafe { libc::madvise(ptr.as_ptr().cast(), bytes, libc::MADV_HUGEPAGE) };
         }
-        // SAFETY: `len` floats were allocated. After the advice, since the first touch decides the kind of a page.
-        unsafe { ptr.write_bytes(0, len) };
-        AlignedVec { ptr, len }
+        AlignedVec { base, ptr: ptr.cast(), len }
     }
 
     /// Grows to at least `len` elements; keeps the old contents, new elements are zero.
@@ -60,18 +66,25 @@ impl AlignedVec {
         self.ptr.as_ptr()
     }
 
+    /// What the address of `len` floats is a multiple of.
+    fn align(len: usize) -> usize {
+        if len >= HUGE_PAGE / 2 / size_of::<f32>() { HUGE_PAGE } else { ALIGN }
+    }
+
+    /// Room for `len` floats at an aligned address, up to the end of a page.
     fn layout(len: usize) -> Layout {
-        let bytes = len.checked_mul(size_of::<f32>()).expect("buffer size overflows");
-        let align = if bytes >= HUGE_PAGE / 2 { HUGE_PAGE } else { ALIGN };
-        Layout::from_size_align(bytes, align).expect("buffer size overflows").pad_to_align()
+        let align = Self::align(len);
+        let bytes = len.checked_mul(size_of::<f32>()).and_then(|b| b.checked_next_multiple_of(align));
+        let bytes = bytes.and_then(|b| b.checked_add(align)).expect("buffer size overflows");
+        Layout::from_size_align(bytes, align_of::<f32>()).expect("buffer size overflows")
     }
 }
 
 impl Drop for AlignedVec {
     fn drop(&mut self) {
         if self.len > 0 {
-            // SAFETY: `len > 0`, so `ptr` came from `alloc_zeroed` with this very layout and is freed only here.
-            unsafe { dealloc(self.ptr.as_ptr().cast(), Self::layout(self.len)) }
+            // SAFETY: `len > 0`, so `base` came from `alloc_zeroed` with this very layout and is freed only here.
+            unsafe { dealloc(self.base.as_ptr(), Self::layout(self.len)) }
         }
     }
 }

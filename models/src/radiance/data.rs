@@ -59,6 +59,7 @@ impl SpaceData {
             train_limit: wanted.train_views.limit(),
             val_limit: wanted.val_views.limit(),
             test_limit: wanted.test_views.limit(),
+            no_train_depths: true,
             ..LoadOptions::default()
         };
         let scene = match wanted.path.as_str() {

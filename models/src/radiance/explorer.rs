@@ -9,7 +9,7 @@ use crate::evaluation::{pose_errors, procrustes};
 use crate::geometry::Pose;
 use crate::run::RunFolder;
 use crate::run::metrics::{Entry, Final, Measured, Metrics};
-use crate::scene::Intrinsics;
+use crate::scene::{Intrinsics, View};
 use crate::training::learner::psnr;
 use crate::training::{Learner, Training};
 use crate::warps::Warp;
@@ -23,6 +23,7 @@ const VIEW_PIXELS: usize = 2048;
 
 /// A model in training.
 pub struct Explorer {
+    /// Without the images of the training views, which live on the device.
     pub data: SpaceData,
     settings: Settings,
     learner: Learner,
@@ -48,7 +49,12 @@ pub struct Rendered {
 
 impl Explorer {
     /// Compiles the programs and fills their inputs.
-    pub fn new(settings: &Settings, data: SpaceData, warp: Arc<dyn Warp>, device: Device) -> Result<Explorer, Error> {
+    pub fn new(
+        settings: &Settings,
+        mut data: SpaceData,
+        warp: Arc<dyn Warp>,
+        device: Device,
+    ) -> Result<Explorer, Error> {
         let views = data.scene.train.len();
         let model = RadianceModel::new(settings, data.size, views, warp).map_err(SpaceDataError::from)?;
         let view_pixels = VIEW_PIXELS.min(data.size.pixels());
@@ -63,8 +69,12 @@ impl Explorer {
         learner.set(model::FOUND, &nothing_found(views))?;
         let intrinsics: Vec<f32> = data.scene.train.iter().flat_map(|v| lens(&v.intrinsics)).collect();
         learner.set(model::INTRINSICS, &intrinsics)?;
-        let images: Vec<f32> = data.scene.train.iter().flat_map(|v| v.rgb.iter().copied()).collect();
-        learner.set(model::IMAGES, &images)?;
+        // From here on the images live on the device.
+        for (i, view) in data.scene.train.iter_mut().enumerate() {
+            let pixels: Vec<u32> = model::packed(view).collect();
+            learner.session.set_u32_from(model::IMAGES, i * pixels.len(), &pixels)?;
+            (view.pixels, view.depth, view.mask) = (vec![], None, None);
+        }
         let (rays, flops, settings) = (model.rays_per_view() * views, model.flops(), settings.clone());
         Ok(Explorer { data, settings, learner, train, view, refine, view_pixels, rays, flops, scores: None })
     }
@@ -102,11 +112,11 @@ impl Explorer {
         Ok(seen)
     }
 
-    /// `pose` after test-time refinement against an image: `P Exp(twist)` with Adam on the twist, the field as it is.
-    pub fn refined(&mut self, pose: &Pose, intrinsics: &Intrinsics, image: &[f32]) -> Result<Pose, Error> {
+    /// `pose` after test-time refinement against a view's image: `P Exp(twist)` with Adam on the twist, the field as it is.
+    pub fn refined(&mut self, pose: &Pose, view: &View) -> Result<Pose, Error> {
         let steps = self.settings.train.as_ref().map_or(0, |t| t.refine_steps);
-        self.set_view(pose, intrinsics)?;
-        self.learner.set(model::VIEW_IMAGE, image)?;
+        self.set_view(pose, &view.intrinsics)?;
+        self.learner.set_u32(model::VIEW_IMAGE, &model::packed(view).collect::<Vec<_>>())?;
         for state in [model::TWIST.to_string(), format!("adam.m.{}", model::TWIST), format!("adam.v.{}", model::TWIST)]
         {
             self.learner.set(&state, &[0.0; 6])?;

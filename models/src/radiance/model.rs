@@ -13,6 +13,7 @@
 use super::rays::{Cameras, ImageSize, Rays, range_of};
 use crate::config::{DepthSettings, RadianceSettings, SceneSettings, Settings, TrainSettings};
 use crate::fields::RadianceField;
+use crate::scene::View;
 use crate::training::optimise::{PROGRESS, STEP, hold_first, updates};
 use crate::warps::{self, Registration, Warp};
 use raygrad_compiler::autodiff::grad;
@@ -23,12 +24,13 @@ use raygrad_compiler::functions::loss::mean_squared_error;
 use raygrad_compiler::functions::matrix::compose_poses;
 use raygrad_compiler::functions::mlp::Parameter;
 use raygrad_compiler::ops::input::Role;
+use raygrad_compiler::ops::pick::concat;
 use raygrad_compiler::ops::random;
 use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Axes, Axis, Shape, Step, Tensor};
 use std::sync::Arc;
 
-/// Colours of all training images, `[frame, pixel] x 3`.
+/// All training images, `[frame, pixel] x 1`, packed as by [`packed`].
 pub const IMAGES: &str = "data.images";
 /// fx, fy, cx, cy of every frame.
 pub const INTRINSICS: &str = "data.intrinsics";
@@ -43,7 +45,7 @@ pub const VIEW_POSE: &str = "view.pose";
 pub const VIEW_INTRINSICS: &str = "view.intrinsics";
 pub const VIEW_FIRST: &str = "view.first";
 pub const VIEW_RANGE: &str = "view.range";
-/// The image that a view is refined against, `[pixel] x 3`, and the twist that refines its pose.
+/// The image that a view is refined against, `[pixel] x 1`, packed as by [`packed`], and the twist that refines its pose.
 pub const VIEW_IMAGE: &str = "view.image";
 pub const TWIST: &str = "view.twist";
 pub const TWIST_LR: &str = "view.lr";
@@ -98,6 +100,11 @@ impl RadianceModel {
         Ok(RadianceModel { settings, size, train, warp, field, frame, pixel, code })
     }
 
+    /// The axis of the training views.
+    pub fn frame(&self) -> &Axis {
+        &self.frame
+    }
+
     /// Everything that is trained.
     pub fn parameters(&self) -> Vec<Parameter> {
         self.field.parameters().into_iter().chain(self.warp_parameters()).collect()
@@ -128,12 +135,13 @@ impl RadianceModel {
         let draw = random::uniform(&Axes::new([ray.clone()]), 1, PIXELS, &step);
         let pixels = self.size.pixels() as f64;
         let index = (draw * pixels).clamp(0.0, pixels - 1.0).to_u32();
-        self.step_at(&ray, &index)
+        let shape = Shape::new(&[&self.frame, &self.pixel], 1).with_dtype(DType::U32);
+        self.step_at(&ray, &index, &on_white(&Tensor::data(IMAGES, shape).take(&index, &self.pixel)))
     }
 
-    /// One training step on the pixels `index` along `ray`, the same in every image.
+    /// One training step on the pixels `index` along `ray`, the same in every image, whose colours are `[frame, ray] x 3`.
     #[track_caller]
-    pub fn step_at(&self, ray: &Axis, index: &Tensor) -> Step {
+    pub fn step_at(&self, ray: &Axis, index: &Tensor, colors: &Tensor) -> Step {
         let intrinsics = Tensor::data(INTRINSICS, Shape::new(&[&self.frame], 4));
         let rough = Tensor::data(POSES, Shape::new(&[&self.frame], (3, 4)));
         let cameras = Cameras::new(&self.frame, ray, index, self.size, &intrinsics, &rough);
@@ -149,8 +157,7 @@ impl RadianceModel {
             _ => self.fixed_range(),
         };
         let seen = self.render(&rays, &range, &Axes::new([self.frame.clone(), ray.clone()]), true);
-        let images = Tensor::data(IMAGES, Shape::new(&[&self.frame, &self.pixel], 3));
-        let render = mean_squared_error(&seen, &images.take(index, &self.pixel));
+        let render = mean_squared_error(&seen, colors);
         let weight = self.settings.loss.alignment;
         let aligned = match &found.residual {
             Some(residual) if weight > 0.0 => &render + residual * weight,
@@ -195,8 +202,8 @@ impl RadianceModel {
         let twist = Tensor::input(TWIST, Role::State, Shape::new(&[], 6));
         let rays = self.view_rays(&point, &index, &compose_poses(&view_pose(), &se3_exp(&twist)));
         let seen = self.render(&rays, &self.view_range(), &Axes::new([point]), true);
-        let image = Tensor::data(VIEW_IMAGE, Shape::new(&[&self.pixel], 3));
-        let render = mean_squared_error(&seen, &image.take(&index, &self.pixel));
+        let image = Tensor::data(VIEW_IMAGE, Shape::new(&[&self.pixel], 1).with_dtype(DType::U32));
+        let render = mean_squared_error(&seen, &on_white(&image.take(&index, &self.pixel)));
         let gradient = grad(&render, &[&twist]).remove(0);
         let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
         let scalars = StepScalars { lr: scalar(TWIST_LR), bias1: scalar(TWIST_BIAS1), bias2: scalar(TWIST_BIAS2) };
@@ -263,6 +270,20 @@ impl RadianceModel {
         }
         seen
     }
+}
+
+/// Pixels as the graph takes them: red, green, blue and opacity from the lowest byte up.
+pub fn packed(view: &View) -> impl Iterator<Item = u32> + '_ {
+    view.pixels.iter().map(|p| u32::from_le_bytes(*p))
+}
+
+/// Colours of packed pixels on white, as [`View::rgb`].
+#[track_caller]
+fn on_white(pixels: &Tensor) -> Tensor {
+    let byte =
+        |i: u32| pixels.shift_right(&Tensor::integers(&[8 * i])).bit_and(&Tensor::integers(&[255])).to_f32() / 255.0;
+    let opacity = byte(3);
+    concat([&byte(0), &byte(1), &byte(2)]) * &opacity + (1.0 - &opacity)
 }
 
 /// Initial values of the state [`FOUND`]: nothing found yet.

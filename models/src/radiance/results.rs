@@ -11,6 +11,7 @@ use crate::report::{Picture, Report};
 use crate::run::RunFolder;
 use crate::run::metrics::Metrics;
 use crate::run::results::{FRAMES, animation};
+use crate::scene::View;
 use crate::training::Training;
 use serde::{Deserialize, Serialize};
 
@@ -47,16 +48,15 @@ pub fn write_data(folder: &RunFolder, data: &SpaceData) -> Result<(), Error> {
 
 /// One frame of the animation: the first validation view as it is seen now.
 pub fn write_frame(folder: &RunFolder, explorer: &mut Explorer) -> Result<(), Error> {
-    let Some(view) = explorer.data.scene.val.first().or(explorer.data.scene.train.first()).cloned() else {
-        return Ok(());
-    };
+    let scene = &explorer.data.scene;
+    let Some(View { pose, intrinsics, .. }) = scene.val.first().or(scene.train.first()).cloned() else { return Ok(()) };
     let poses = explorer.poses()?;
-    let pose = match view.pose {
+    let pose = match pose {
         Some(pose) => to_learned(&poses, explorer.data.truth.as_deref())?.to_learned(&pose),
         None => poses[0],
     };
-    let seen = explorer.render(&pose, &view.intrinsics)?;
-    let canvas = Canvas::from_colors(view.intrinsics.width, view.intrinsics.height, &seen.rgb);
+    let seen = explorer.render(&pose, &intrinsics)?;
+    let canvas = Canvas::from_colors(intrinsics.width, intrinsics.height, &seen.rgb);
     folder.write(&format!("{FRAMES}/{:07}.png", explorer.steps_done()), &canvas.to_png()?)?;
     Ok(())
 }
@@ -87,8 +87,9 @@ pub fn write_results(
         let pose = similarity.to_learned(&reference);
         let before = explorer.render(&pose, &view.intrinsics)?;
         let (width, height) = (view.intrinsics.width, view.intrinsics.height);
+        let photo = view.rgb();
         let score = |seen: &Rendered| -> Result<(f64, f64), Error> {
-            let (a, b) = (Measured::new(width, height, &seen.rgb)?, Measured::new(width, height, &view.rgb)?);
+            let (a, b) = (Measured::new(width, height, &seen.rgb)?, Measured::new(width, height, &photo)?);
             Ok((psnr(&a, &b)?, ssim(&a, &b)?))
         };
         let (psnr_db, ssim_before) = score(&before)?;
@@ -101,7 +102,7 @@ pub fn write_results(
         };
         let mut best = before;
         if refines {
-            let refined = explorer.refined(&pose, &view.intrinsics, &view.rgb)?;
+            let refined = explorer.refined(&pose, view)?;
             best = explorer.render(&refined, &view.intrinsics)?;
             let (p, s) = score(&best)?;
             (of_view.refined_psnr_db, of_view.refined_ssim) = (Some(p), Some(s));
@@ -112,7 +113,7 @@ pub fn write_results(
         let depth = Canvas::from_colors(width, height, &depth_colors(&best, similarity.scale));
         folder.write(&format!("test/{i:03}_depth.png"), &depth.to_png()?)?;
         if shown.len() < SHOWN {
-            shown.push([Canvas::from_colors(width, height, &view.rgb), rgb, depth]);
+            shown.push([Canvas::from_colors(width, height, &photo), rgb, depth]);
         }
     }
     let mean = |value: &dyn Fn(&ViewScore) -> Option<f64>| {

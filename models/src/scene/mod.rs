@@ -61,15 +61,37 @@ impl Intrinsics {
 pub struct View {
     /// The image as the scene's own files call it.
     pub name: String,
-    /// Colours in 0..=1, row by row, three a pixel; on the background where the image is transparent.
-    pub rgb: Vec<f32>,
+    /// Red, green, blue and opacity of every pixel, row by row.
+    pub pixels: Vec<[u8; 4]>,
+    /// Whether the image can be transparent.
+    pub transparent: bool,
     pub intrinsics: Intrinsics,
     /// Reference pose; `None` where nobody knows it.
     pub pose: Option<Pose>,
-    /// Share of the foreground, 0..=1, one number a pixel: opacity, or the mask that comes with the image.
-    pub mask: Option<Vec<f32>>,
+    /// The mask that comes with the image, one value a pixel: whether all of it is foreground.
+    pub mask: Option<Vec<bool>>,
     /// Depth along the optical axis in the loaded world's unit, one number a pixel; 0 where unknown.
     pub depth: Option<Vec<f32>>,
+}
+
+impl View {
+    /// Colours in 0..=1, row by row, three a pixel; on white where the image is transparent.
+    pub fn rgb(&self) -> Vec<f32> {
+        let unit = |byte: u8| f32::from(byte) / 255.0;
+        let on_white = |p: &[u8; 4]| -> [f32; 3] {
+            let opacity = unit(p[3]);
+            std::array::from_fn(|c| unit(p[c]) * opacity + (1.0 - opacity))
+        };
+        self.pixels.iter().flat_map(on_white).collect()
+    }
+
+    /// Share of the foreground, 0..=1, one number a pixel: the mask that comes with the image, or its opacity.
+    pub fn foreground(&self) -> Option<Vec<f32>> {
+        match &self.mask {
+            Some(mask) => Some(mask.iter().map(|m| f32::from(u8::from(*m))).collect()),
+            None => self.transparent.then(|| self.pixels.iter().map(|p| f32::from(p[3]) / 255.0).collect()),
+        }
+    }
 }
 
 /// Where along a ray there is something to see, as depth along the optical axis.
@@ -137,12 +159,12 @@ pub struct LoadOptions {
     pub val_limit: Option<usize>,
     pub test_limit: Option<usize>,
     pub layout: Option<Layout>,
-    /// Behind transparent images, instead of white.
-    pub background: Option<[f64; 3]>,
     /// Instead of the layout's own, in the loaded world's unit.
     pub depth: Option<DepthRange>,
     /// Focal length in pixels of the image file, for layouts that know none (folders of images).
     pub focal: Option<f64>,
+    /// Leave the depths of training views on the disk.
+    pub no_train_depths: bool,
     /// Keep the rotations that the published loaders of forward-facing scenes produce, which are not exactly rotations,
     /// instead of the nearest ones.
     pub published_rotations: bool,
@@ -158,8 +180,6 @@ pub struct Scene {
     pub val: Vec<View>,
     pub test: Vec<View>,
     pub depth: DepthRange,
-    /// What transparent images were put on; `None` where no image is transparent.
-    pub background: Option<[f64; 3]>,
     /// From the world of the files to the loaded one.
     pub frame: WorldFrame,
     /// Lens distortion that was removed (of the first view; see [`Intrinsics::distortion`]).
@@ -244,6 +264,9 @@ pub fn load(root: &Path, options: &LoadOptions, progress: &(dyn Fn(usize, usize)
     }?;
     let limit = |entries: &mut Vec<Entry>, n: Option<usize>| entries.truncate(n.unwrap_or(usize::MAX));
     limit(&mut listing.train, options.train_limit);
+    if options.no_train_depths {
+        listing.train.iter_mut().for_each(|entry| entry.depth = None);
+    }
     limit(&mut listing.test, options.test_limit);
     if let Some(val) = &mut listing.val {
         limit(val, options.val_limit);
@@ -264,10 +287,8 @@ pub fn load(root: &Path, options: &LoadOptions, progress: &(dyn Fn(usize, usize)
         progress(done.fetch_add(1, Ordering::Relaxed) + 1, entries.len());
         Ok(view)
     };
-    let views: Result<Vec<(View, bool)>, SceneError> = entries.par_iter().map(read).collect();
-    let views = views?;
-    let transparent = views.iter().any(|v| v.1);
-    let mut views: Vec<View> = views.into_iter().map(|v| v.0).collect();
+    let views: Result<Vec<View>, SceneError> = entries.par_iter().map(read).collect();
+    let mut views = views?;
     let test = views.split_off(trained + own_val);
     let val = match listing.val {
         Some(_) => views.split_off(trained),
@@ -279,15 +300,12 @@ pub fn load(root: &Path, options: &LoadOptions, progress: &(dyn Fn(usize, usize)
         val,
         test,
         depth,
-        background: transparent.then(|| options.background.unwrap_or(WHITE)),
         frame: listing.frame,
         removed_distortion: listing.train[0].intrinsics.distortion.filter(|d| d.iter().any(|k| *k != 0.0)),
         notes: listing.notes,
         train: views,
     })
 }
-
-const WHITE: [f64; 3] = [1.0; 3];
 
 fn check_depth(depth: DepthRange, from: &str) -> Result<(), SceneError> {
     let (near, far) = match depth {

@@ -1,7 +1,7 @@
-//! Images, masks and depth maps of one view: read, undistorted, resized, put on the background.
+//! Images, masks and depth maps of one view: read, undistorted, resized.
 
 use super::resize::Bytes;
-use super::{Entry, Intrinsics, LoadOptions, SceneError, View, WHITE, WorldFrame, numpy};
+use super::{Entry, Intrinsics, LoadOptions, SceneError, View, WorldFrame, numpy};
 use image::{DynamicImage, ImageReader};
 use std::path::{Path, PathBuf};
 
@@ -59,8 +59,8 @@ fn decode(path: &Path) -> Result<DynamicImage, SceneError> {
     open(path)?.decode().map_err(|e| decode_error(path, e))
 }
 
-/// The view of an entry, and whether its image can be transparent.
-pub(super) fn read_view(entry: &Entry, frame: &WorldFrame, options: &LoadOptions) -> Result<(View, bool), SceneError> {
+/// The view of an entry.
+pub(super) fn read_view(entry: &Entry, frame: &WorldFrame, options: &LoadOptions) -> Result<View, SceneError> {
     let native = entry.intrinsics;
     let [height, width] = options.size.unwrap_or([native.height, native.width]);
     let image = decode(&entry.image)?;
@@ -72,10 +72,14 @@ pub(super) fn read_view(entry: &Entry, frame: &WorldFrame, options: &LoadOptions
     let lens = Lens::of(&native);
     let flat = lens.as_ref().map_or(bytes.clone(), |lens| lens.remove(&bytes));
     let bytes = flat.resized(height, width);
-    let (rgb, opacity) = composite(&bytes, options.background.unwrap_or(WHITE));
+    let opaque = |p: &[u8; 3]| [p[0], p[1], p[2], 255];
+    let pixels = match transparent {
+        true => bytes.data.as_chunks::<4>().0.to_vec(),
+        false => bytes.data.as_chunks::<3>().0.iter().map(opaque).collect(),
+    };
     let mask = match &entry.mask {
         Some(path) => Some(read_mask(path, &native, lens.as_ref(), [height, width])?),
-        None => opacity,
+        None => None,
     };
     let depth = match &entry.depth {
         Some(file) => Some(read_depth(file, &native, lens.as_ref(), [height, width], frame.scale)?),
@@ -83,40 +87,26 @@ pub(super) fn read_view(entry: &Entry, frame: &WorldFrame, options: &LoadOptions
     };
     let intrinsics = Intrinsics { distortion: None, ..native.resized(height, width) };
     let pose = entry.pose.as_ref().map(|p| frame.load(p));
-    Ok((View { name: entry.name.clone(), rgb, intrinsics, pose, mask, depth }, transparent))
+    Ok(View { name: entry.name.clone(), pixels, transparent, intrinsics, pose, mask, depth })
 }
 
 fn bytes_of(channels: usize, image: &DynamicImage, data: Vec<u8>) -> Bytes {
     Bytes { channels, height: image.height() as usize, width: image.width() as usize, data }
 }
 
-/// Colours on the background, and opacities if there are any.
-fn composite(bytes: &Bytes, background: [f64; 3]) -> (Vec<f32>, Option<Vec<f32>>) {
-    let unit = |byte: u8| f32::from(byte) / 255.0;
-    if bytes.channels == 3 {
-        return (bytes.data.iter().map(|b| unit(*b)).collect(), None);
-    }
-    let pixels = bytes.data.as_chunks::<4>().0;
-    let over = |p: &[u8; 4]| -> [f32; 3] {
-        let alpha = unit(p[3]);
-        std::array::from_fn(|c| unit(p[c]) * alpha + background[c] as f32 * (1.0 - alpha))
-    };
-    (pixels.iter().flat_map(over).collect(), Some(pixels.iter().map(|p| unit(p[3])).collect()))
-}
-
-/// A mask: 1 where all of the pixel is foreground (white in the file), else 0.
+/// A mask: whether all of a pixel is foreground (white in the file).
 fn read_mask(
     path: &Path,
     native: &Intrinsics,
     lens: Option<&Lens>,
     [height, width]: [usize; 2],
-) -> Result<Vec<f32>, SceneError> {
+) -> Result<Vec<bool>, SceneError> {
     let image = decode(path)?;
     let first = image.to_rgb8().into_raw().chunks_exact(3).map(|p| if p[0] == 255 { 255 } else { 0 }).collect();
     let bytes = bytes_of(1, &image, first);
     same_size(path, [bytes.height, bytes.width], native)?;
     let flat = lens.map_or(bytes.clone(), |lens| lens.remove(&bytes));
-    Ok(flat.resized(height, width).data.iter().map(|b| f32::from(u8::from(*b == 255))).collect())
+    Ok(flat.resized(height, width).data.iter().map(|b| *b == 255).collect())
 }
 
 fn same_size(path: &Path, found: [usize; 2], native: &Intrinsics) -> Result<(), SceneError> {
@@ -282,16 +272,6 @@ mod tests {
                 assert!((f64::from(found.data[i * 32 + j]) - expected).abs() < 2.5, "row {i}, column {j}");
             }
         }
-    }
-
-    #[test]
-    fn transparency_after_resizing() {
-        let bytes = Bytes { channels: 4, height: 1, width: 2, data: vec![255, 0, 0, 51, 0, 0, 0, 0] };
-        let (rgb, alpha) = composite(&bytes, [1.0, 1.0, 0.5]);
-        for (a, b) in rgb.iter().zip([1.0, 0.8, 0.4, 1.0, 1.0, 0.5]) {
-            assert!((a - b).abs() < 1e-6, "{rgb:?}");
-        }
-        assert_eq!(alpha, Some(vec![0.2, 0.0]));
     }
 
     #[test]

@@ -108,9 +108,9 @@ impl Executor for CpuExecutor {
         Ok(self.programs.len() - 1)
     }
 
-    fn set(&mut self, input: &str, lanes: &[u32]) -> Result<(), RunError> {
-        let (place, len) = self.input(input)?;
-        self.memory[place][..len].copy_from_slice(bytemuck::cast_slice(lanes));
+    fn set(&mut self, input: &str, first: usize, lanes: &[u32]) -> Result<(), RunError> {
+        let (place, _) = self.input(input)?;
+        self.memory[place][first..first + lanes.len()].copy_from_slice(bytemuck::cast_slice(lanes));
         Ok(())
     }
 

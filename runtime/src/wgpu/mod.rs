@@ -112,9 +112,9 @@ impl Executor for WgpuExecutor {
         Ok(self.programs.len() - 1)
     }
 
-    fn set(&mut self, input: &str, lanes: &[u32]) -> Result<(), RunError> {
+    fn set(&mut self, input: &str, first: usize, lanes: &[u32]) -> Result<(), RunError> {
         let (arena, place, _) = self.input(input)?;
-        let first = place.offset as usize;
+        let first = place.offset as usize + first;
         match self.mirrors.get_mut(&arena) {
             Some(mirror) => {
                 mirror.lanes[first..first + lanes.len()].copy_from_slice(lanes);

@@ -88,8 +88,8 @@ fn sound(scene: &Scene, [height, width]: [usize; 2], counts: [usize; 3]) {
     assert_eq!([scene.train.len(), scene.val.len(), scene.test.len()], counts, "{}", scene.root.display());
     for view in scene.train.iter().chain(&scene.val).chain(&scene.test) {
         assert_eq!((view.intrinsics.height, view.intrinsics.width), (height, width));
-        assert_eq!(view.rgb.len(), height * width * 3);
-        assert!(view.rgb.iter().all(|c| (0.0..=1.0).contains(c)), "{}", view.name);
+        assert_eq!(view.pixels.len(), height * width);
+        assert!(view.rgb().iter().all(|c| (0.0..=1.0).contains(c)), "{}", view.name);
         assert!(view.mask.as_ref().is_none_or(|m| m.len() == height * width));
         let pose = view.pose.expect("a pose");
         assert!(pose.rigidity_error() < 1e-3, "{}", view.name);
@@ -108,9 +108,8 @@ fn blender_scenes_load() {
         let Some(scene) = scene(&format!("blender/{name}"), &options) else { return };
         sound(&scene, [100, 100], counts);
         assert_eq!(scene.depth, DepthRange::Metric { near: 2.0, far: 6.0 });
-        assert_eq!(scene.background, Some([1.0; 3]));
         // Corners of the images are background.
-        assert!(scene.train.iter().all(|v| v.rgb[..3] == [1.0; 3] && v.mask.as_ref().unwrap()[0] == 0.0));
+        assert!(scene.train.iter().all(|v| v.rgb()[..3] == [1.0; 3] && v.foreground().unwrap()[0] == 0.0));
     }
 }
 
@@ -130,7 +129,7 @@ fn scan24_loads() {
     sound(&scene, [75, 100], [42, 7, 7]);
     let DepthRange::Metric { near, far } = scene.depth else { panic!("{:?}", scene.depth) };
     assert!((near - 1.558).abs() < 1e-3 && (far / near - 13.0 / 3.0).abs() < 1e-9);
-    let mask = scene.train[0].mask.as_ref().unwrap();
+    let mask = scene.train[0].foreground().unwrap();
     let share = mask.iter().sum::<f32>() / mask.len() as f32;
     assert!((0.05..0.9).contains(&share), "{share}");
 }

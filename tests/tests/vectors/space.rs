@@ -3,7 +3,7 @@
 use raygrad::config::Layered;
 use raygrad::geometry::Pose;
 use raygrad::radiance::RadianceModel;
-use raygrad::radiance::model::{FOUND, IMAGES, INTRINSICS, POSES, nothing_found};
+use raygrad::radiance::model::{FOUND, INTRINSICS, POSES, nothing_found};
 use raygrad::radiance::rays::ImageSize;
 use raygrad::training::Rates;
 use raygrad::warps;
@@ -132,7 +132,10 @@ fn check(case: &Case) {
     let index: Vec<Vec<f64>> = case.input("ray_idx_per_iteration").as_array().unwrap().iter().map(numbers).collect();
     let ray = Axis::new("ray", index[0].len());
     let draw = Tensor::data("draw", Shape::new(&[&ray], 1).with_dtype(DType::U32));
-    let step = model.step_at(&ray, &draw);
+    let pixel = Axis::new("pixel", case.count("H") * case.count("W"));
+    let frame = model.frame();
+    let pictures = Tensor::data("pictures", Shape::new(&[frame, &pixel], 3));
+    let step = model.step_at(&ray, &draw, &pictures.take(&draw, &pixel));
     let output = |name: &str| step.outputs.iter().find(|(n, _)| n == name).map(|(_, t)| t.clone());
     let total = output("total").unwrap();
     let parameters: Vec<Tensor> = model.parameters().into_iter().map(|p| p.tensor).collect();
@@ -147,7 +150,7 @@ fn check(case: &Case) {
         })
         .collect();
     let known: Vec<(&str, Vec<f64>)> = vec![
-        (IMAGES, images(case)),
+        ("pictures", images(case)),
         (INTRINSICS, lens),
         (POSES, rough.iter().flat_map(|p| p.to_rows()).collect()),
         (FOUND, nothing_found(views).iter().map(|x| f64::from(*x)).collect()),

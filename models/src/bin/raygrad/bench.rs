@@ -2,7 +2,7 @@
 
 use crate::Choice;
 use clap::Args;
-use raygrad::config::ConfigError;
+use raygrad::config::{ConfigError, Count};
 use raygrad_kernels::cpu::peak::peak_gflops;
 use serde::Serialize;
 use std::process::ExitCode;
@@ -44,7 +44,11 @@ const SECONDS: f64 = 5.0;
 const LEAST: usize = 10;
 
 pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
-    let experiment = args.choice.experiment()?;
+    let mut experiment = args.choice.experiment()?;
+    if let Some(scene) = &mut experiment.layered.settings.scene {
+        // A step needs the training views alone.
+        (scene.val_views, scene.test_views) = (Count::Of(0), Count::Of(0));
+    }
     let mut trainer = experiment.training()?;
     let settings = &experiment.layered.settings;
     let threads = settings.run.threads.of(std::thread::available_parallelism().map_or(1, usize::from));

@@ -98,10 +98,10 @@ fn summary(scene: &Scene) -> String {
         line("scale", format!("1 unit of the files is {:.5} here", scene.frame.scale));
     }
     let count = |has: &dyn Fn(&View) -> bool| all.iter().filter(|v| has(v)).count();
-    let (masks, depths) = (count(&|v| v.mask.is_some()), count(&|v| v.depth.is_some()));
+    let (masks, depths) = (count(&|v| v.mask.is_some() || v.transparent), count(&|v| v.depth.is_some()));
     line("masks, depths", format!("{masks} and {depths} of {} views", all.len()));
-    if let Some([r, g, b]) = scene.background {
-        line("background", format!("{r}, {g}, {b} behind transparent pixels"));
+    if scene.train.iter().any(|v| v.transparent) {
+        line("background", "white behind transparent pixels".to_string());
     }
     for note in &scene.notes {
         line("note", note.clone());

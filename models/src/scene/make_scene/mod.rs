@@ -21,8 +21,8 @@ const RADIUS: f64 = 4.0;
 const ANGLE_X: f64 = 0.69;
 /// Lowest and highest elevation of a camera, in degrees.
 const ELEVATION: [f64; 2] = [8.0, 70.0];
-/// Rays along each side of a pixel.
-const SAMPLES: usize = 4;
+/// Rays along each side of a picture, where that leaves 2 to 4 along each side of a pixel.
+const RAYS: usize = 800;
 const SIZES: std::ops::RangeInclusive<usize> = 8..=2048;
 
 /// What to make.
@@ -151,13 +151,14 @@ fn render(world: &World, camera: &Camera, size: usize) -> Picture {
         let half = size as f64 / 2.0;
         camera.axes * Vector3::new((u - half) / focal, -(v - half) / focal, -1.0)
     };
+    let samples = (RAYS / size).clamp(2, 4);
     let mut picture = Picture { bytes: vec![], depth: vec![] };
     for pixel in 0..size * size {
         let (u, v) = ((pixel % size) as f64, (pixel / size) as f64);
         let (mut sum, mut hits) = (Vector3::zeros(), 0);
-        for sample in 0..SAMPLES * SAMPLES {
-            let within = |i: usize| (i as f64 + 0.5) / SAMPLES as f64;
-            let direction = ray(u + within(sample % SAMPLES), v + within(sample / SAMPLES));
+        for sample in 0..samples * samples {
+            let within = |i: usize| (i as f64 + 0.5) / samples as f64;
+            let direction = ray(u + within(sample % samples), v + within(sample / samples));
             if let Some(color) = world.color(&camera.center, &direction) {
                 sum += color;
                 hits += 1;
@@ -165,7 +166,7 @@ fn render(world: &World, camera: &Camera, size: usize) -> Picture {
         }
         let mean = sum / f64::from(hits.max(1));
         picture.bytes.extend(mean.iter().map(|c| (c.clamp(0.0, 1.0) * 255.0).round() as u8));
-        picture.bytes.push((f64::from(hits) * 255.0 / (SAMPLES * SAMPLES) as f64).round() as u8);
+        picture.bytes.push((f64::from(hits) * 255.0 / (samples * samples) as f64).round() as u8);
         picture.depth.push(world.depth(&camera.center, &ray(u + 0.5, v + 0.5)).unwrap_or(0.0) as f32);
     }
     picture
@@ -225,7 +226,8 @@ mod tests {
         assert!(compared > 200 && agree + nearer > compared * 9 / 10, "{agree} and {nearer} of {compared}");
         // The two stand nearly opposite each other, so that most of what one sees is hidden from the other.
         assert!(agree > compared / 6, "{agree} of {compared}");
-        let opaque = a.mask.as_ref().unwrap().iter().zip(a.depth.as_ref().unwrap());
+        let foreground = a.foreground().unwrap();
+        let opaque = foreground.iter().zip(a.depth.as_ref().unwrap());
         assert!(
             opaque.clone().all(|(m, z)| *m < 1.0 || *z > 0.0) && opaque.clone().all(|(m, z)| *m > 0.0 || *z == 0.0)
         );
