@@ -5,6 +5,7 @@
 
 mod error;
 mod layers;
+mod names;
 mod presets;
 mod settings;
 mod validate;

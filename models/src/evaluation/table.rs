@@ -1,4 +1,5 @@
-//! Results as tables in the papers' layout: a row for each metric and method, a column for each scene, and the mean.
+//! Results as tables in the papers' layout: a row for each metric and method, a column for each scene, and the mean. Of
+//! several runs of one method on one scene a cell holds the mean and the standard deviation.
 
 use super::published::PublishedTable;
 use super::scores::{Evaluation, Measured, Metric, Scores, Stage};
@@ -14,6 +15,25 @@ pub struct Table {
     pub published: Vec<PublishedTable>,
 }
 
+/// One number of a table.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Cell {
+    pub mean: f64,
+    /// Standard deviation over runs, with n - 1; nothing for one run.
+    pub spread: Option<f64>,
+}
+
+impl Cell {
+    /// Of several runs; nothing of none.
+    fn of(values: &[f64]) -> Option<Cell> {
+        let n = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / n;
+        let squares = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>();
+        let spread = (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt());
+        (!values.is_empty()).then_some(Cell { mean, spread })
+    }
+}
+
 /// One line of a table.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Row {
@@ -25,9 +45,9 @@ pub struct Row {
     pub source: Option<String>,
     pub verified: bool,
     /// One for each of [`Table::scenes`].
-    pub values: Vec<Option<f64>>,
+    pub values: Vec<Option<Cell>>,
     /// Over the scenes that have a value; of a paper that only has means, its mean.
-    pub mean: Option<f64>,
+    pub mean: Option<Cell>,
 }
 
 impl Row {
@@ -46,7 +66,7 @@ impl Row {
         }
     }
 
-    fn cells(&self) -> impl Iterator<Item = Option<f64>> {
+    fn cells(&self) -> impl Iterator<Item = Option<Cell>> {
         self.values.iter().copied().chain([self.mean])
     }
 }
@@ -85,7 +105,7 @@ impl Table {
         let mut rows = vec![];
         for metric in Metric::ALL {
             let stages: &[Option<Stage>] =
-                if metric.is_of_poses() { &[None] } else { &[Some(Stage::Before), Some(Stage::After)] };
+                if metric.is_of_views() { &[Some(Stage::Before), Some(Stage::After)] } else { &[None] };
             for stage in stages {
                 rows.extend(methods.iter().filter_map(|m| self.our_row(metric, *stage, m, &scenes)));
                 rows.extend(self.published.iter().flat_map(|t| published_rows(t, metric, *stage, &scenes)));
@@ -95,12 +115,12 @@ impl Table {
     }
 
     fn our_row(&self, metric: Metric, stage: Option<Stage>, method: &str, scenes: &[String]) -> Option<Row> {
-        let value = |scene: &String| {
-            let run = self.evaluations.iter().find(|e| e.method == method && e.scene == *scene)?;
-            let measured = stage.map_or(Some(&run.cameras), |s| run.stage(s))?;
-            measured.mean.get(metric)
+        let cell = |scene: &String| {
+            let runs = self.evaluations.iter().filter(|e| e.method == method && e.scene == *scene);
+            let value = |run: &Evaluation| stage.map_or(Some(&run.cameras), |s| run.stage(s))?.mean.get(metric);
+            Cell::of(&runs.filter_map(value).collect::<Vec<f64>>())
         };
-        let values: Vec<Option<f64>> = scenes.iter().map(value).collect();
+        let values: Vec<Option<Cell>> = scenes.iter().map(cell).collect();
         let mean = mean(&values)?;
         Some(Row { metric, stage, method: method.into(), source: None, verified: true, values, mean: Some(mean) })
     }
@@ -125,14 +145,25 @@ impl Table {
         out
     }
 
-    /// Comma-separated, with a head line.
+    /// Comma-separated, with a head line. Where any cell is of several runs, each column is followed by its spread.
     pub fn to_csv(&self) -> String {
-        let mut out = csv_line(&self.head(["metric", "stage", "method", "source", "verified"]));
-        for row in self.rows() {
+        let rows = self.rows();
+        let spreads = rows.iter().flat_map(Row::cells).flatten().any(|c| c.spread.is_some());
+        let first = ["metric", "stage", "method", "source", "verified"];
+        let head = self.head(first).into_iter().enumerate().flat_map(|(i, name)| {
+            let spread = (spreads && i >= first.len()).then(|| format!("{name} spread"));
+            [Some(name), spread].into_iter().flatten()
+        });
+        let mut out = csv_line(&head.collect::<Vec<String>>());
+        for row in rows {
             let stage = row.stage.map_or("", Stage::name).to_string();
             let source = row.source.clone().unwrap_or_else(|| "ours".into());
             let head = [row.metric.key().to_string(), stage, row.method.clone(), source, row.verified.to_string()];
-            let cells = row.cells().map(|v| v.map(|v| v.to_string()).unwrap_or_default());
+            let cells = row.cells().flat_map(|c| {
+                let text = |v: Option<f64>| v.map(|v| v.to_string()).unwrap_or_default();
+                let both = [text(c.map(|c| c.mean)), text(c.and_then(|c| c.spread))];
+                both.into_iter().take(if spreads { 2 } else { 1 })
+            });
             out += &csv_line(&head.into_iter().chain(cells).collect::<Vec<String>>());
         }
         out
@@ -176,7 +207,7 @@ impl Table {
             }
             let group: Vec<&Row> = rows.iter().filter(|r| (r.metric, r.stage) == (row.metric, row.stage)).collect();
             let cells = row.cells().enumerate().map(|(i, v)| {
-                let text = number(row.metric, v);
+                let text = number(row.metric, v).replace('±', "$\\pm$");
                 if is_best(row.metric, v, group.iter().map(|r| r.cells().nth(i).flatten())) {
                     format!("\\textbf{{{text}}}")
                 } else {
@@ -209,12 +240,12 @@ impl Table {
 fn published_rows(table: &PublishedTable, metric: Metric, stage: Option<Stage>, scenes: &[String]) -> Vec<Row> {
     let rows = table.rows.iter().filter(|r| r.metric == metric && r.stage == stage);
     let shown = rows.filter_map(|r| {
-        let value =
-            |scene: &String| table.scenes.iter().position(|s| s == scene).and_then(|i| r.values.get(i).copied());
-        let values: Vec<Option<f64>> = scenes.iter().map(value).collect();
+        let cell = |mean: f64| Cell { mean, spread: r.spread };
+        let value = |scene: &String| table.scenes.iter().position(|s| s == scene).and_then(|i| r.values.get(i));
+        let values: Vec<Option<Cell>> = scenes.iter().map(|s| value(s).map(|v| cell(*v))).collect();
         let all = values.iter().flatten().count() == table.scenes.len();
         // A mean over other scenes than those shown would not compare with ours.
-        let mean = if all { Some(r.mean) } else { mean(&values) };
+        let mean = if all { Some(cell(r.mean)) } else { mean(&values) };
         let whole = if table.scenes.is_empty() { ", all scenes" } else { "" };
         let source = Some(format!("{}, {}{whole}", table.paper, table.table));
         mean.is_some().then(|| Row {
@@ -230,19 +261,30 @@ fn published_rows(table: &PublishedTable, metric: Metric, stage: Option<Stage>, 
     shown.collect()
 }
 
-fn mean(values: &[Option<f64>]) -> Option<f64> {
-    let known: Vec<f64> = values.iter().flatten().copied().collect();
-    (!known.is_empty()).then(|| known.iter().sum::<f64>() / known.len() as f64)
+/// Over scenes. It has a spread over runs only where it is of one scene.
+fn mean(values: &[Option<Cell>]) -> Option<Cell> {
+    let known: Vec<Cell> = values.iter().flatten().copied().collect();
+    match known[..] {
+        [] => None,
+        [only] => Some(only),
+        _ => Some(Cell { mean: known.iter().map(|c| c.mean).sum::<f64>() / known.len() as f64, spread: None }),
+    }
 }
 
-fn is_best(metric: Metric, value: Option<f64>, group: impl Iterator<Item = Option<f64>>) -> bool {
-    let group: Vec<f64> = group.flatten().collect();
+fn is_best(metric: Metric, value: Option<Cell>, group: impl Iterator<Item = Option<Cell>>) -> bool {
+    let group: Vec<f64> = group.flatten().map(|c| c.mean).collect();
     let best = if metric.lower_is_better() { f64::min } else { f64::max };
-    group.len() > 1 && value.is_some() && value == group.into_iter().reduce(best)
+    group.len() > 1 && value.is_some() && value.map(|c| c.mean) == group.into_iter().reduce(best)
 }
 
-fn number(metric: Metric, value: Option<f64>) -> String {
-    value.map_or("-".into(), |v| format!("{v:.*}", metric.decimals()))
+/// "0.123", or "0.123 ± 0.010" over several runs.
+fn number(metric: Metric, cell: Option<Cell>) -> String {
+    let shown = |v: f64| format!("{v:.*}", metric.decimals());
+    match cell {
+        None => "-".into(),
+        Some(Cell { mean, spread: None }) => shown(mean),
+        Some(Cell { mean, spread: Some(spread) }) => format!("{} ± {}", shown(mean), shown(spread)),
+    }
 }
 
 /// Columns two spaces apart; the first two to the left, numbers to the right.
@@ -306,6 +348,7 @@ mod tests {
             method: method.into(),
             verified,
             mean: (values[0] + values[1]) / 2.0,
+            spread: None,
             values: values.to_vec(),
         };
         let published = PublishedTable {
@@ -345,11 +388,24 @@ mod tests {
         assert!(csv.starts_with("metric,stage,method,source,verified,fern,a_b,mean\n"), "{csv}");
         assert!(csv.contains("rotation_error_deg,,barf,\"P, T\",false,0.125,,0.125\n"), "{csv}");
         let views = table().views_csv();
-        assert!(views.contains("fern,l2g,cameras,\"cam, 1\",0.25,,,,,\n"), "{views}");
-        assert!(views.contains("fern,l2g,before,mean,,,21,,,\n"), "{views}");
+        assert!(views.contains("fern,l2g,cameras,\"cam, 1\",0.25,,,,,,,,\n"), "{views}");
+        assert!(views.contains("fern,l2g,before,mean,,,21,,,,,,\n"), "{views}");
         let latex = table().to_latex();
         assert!(latex.contains("a\\_b") && latex.contains("\\textbf{0.125}"), "{latex}");
         assert!(latex.starts_with("\\begin{tabular}{llrrr}\n") && latex.contains("\\end{tabular}"), "{latex}");
+    }
+
+    #[test]
+    fn several_runs_make_a_mean_and_a_spread() {
+        let runs = [0.25, 0.5, 0.75].map(|degrees| run("fern", "l2g", degrees, [20.0; 2]));
+        let table = Table { evaluations: runs.to_vec(), ..table() };
+        let text = table.to_text();
+        assert!(text.contains("0.500 ± 0.250  0.500 ± 0.250") && text.contains("0.125"), "{text}");
+        let csv = table.to_csv();
+        assert!(csv.starts_with("metric,stage,method,source,verified,fern,fern spread,mean,mean spread\n"), "{csv}");
+        assert!(csv.contains("rotation_error_deg,,l2g,ours,true,0.5,0.25,0.5,0.25\n"), "{csv}");
+        assert!(csv.contains("rotation_error_deg,,barf,\"P, T\",false,0.125,,0.125,\n"), "{csv}");
+        assert!(table.to_latex().contains("0.500 $\\pm$ 0.250"), "{}", table.to_latex());
     }
 
     #[test]
@@ -371,7 +427,8 @@ mod tests {
         // Of a table of eight scenes, two are shown: the mean is theirs.
         let ours = Table { evaluations: vec![run("fern", "l2g", 0.2, [20.0; 2])], ..papers };
         let row = ours.rows().into_iter().find(|r| r.method == "inn" && r.metric == Metric::RotationErrorDeg).unwrap();
-        assert_eq!((row.values, row.mean), (vec![Some(0.19)], Some(0.19)));
+        let cell = Some(Cell { mean: 0.19, spread: None });
+        assert_eq!((row.values, row.mean), (vec![cell], cell));
         assert_eq!(Table::default().rows(), []);
         assert_eq!(Table::default().to_text(), "  method  mean\n");
     }

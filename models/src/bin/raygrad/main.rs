@@ -5,10 +5,15 @@
 
 mod bench;
 mod data;
+mod eval;
 mod explain;
+mod export;
+mod held;
 mod make_scene;
 mod progress;
+mod surface;
 mod train;
+mod video;
 
 use clap::{Args, Parser, Subcommand};
 use raygrad::config::PRESETS;
@@ -29,6 +34,12 @@ struct Cli {
 enum Command {
     /// Train an experiment and write its results into a run folder.
     Train(train::TrainArgs),
+    /// Measure a run at its last checkpoint: errors, pictures, the papers' numbers beside them, and its surface.
+    Eval(eval::EvalArgs),
+    /// Write the cameras that a run found for other programs.
+    Export(export::ExportArgs),
+    /// Render the papers' novel views of a run as a video.
+    Video(video::VideoArgs),
     /// List what programs can run on.
     Devices,
     /// List the built-in experiments.
@@ -95,6 +106,9 @@ fn main() -> ExitCode {
     quiet_drivers();
     let done = match Cli::parse().command {
         Command::Train(args) => train::run(&args),
+        Command::Eval(args) => eval::run(&args),
+        Command::Export(args) => export::run(&args),
+        Command::Video(args) => video::run(&args),
         Command::Devices => devices(),
         Command::Presets => presets(),
         Command::Explain(args) => explain::run(&args),

@@ -20,6 +20,9 @@ pub struct TrainArgs {
     /// Perturbation file to register, instead of a drawn one.
     #[arg(long, value_name = "FILE")]
     perturbation: Option<String>,
+    /// Weights of LPIPS, as scripts/convert_lpips.py writes them, to measure test views with.
+    #[arg(long, value_name = "WEIGHTS")]
+    lpips: Option<PathBuf>,
     /// Run folder; by default the first free one of runs/PRESET, runs/PRESET-2, ...
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
@@ -36,6 +39,9 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         if let Some(value) = value {
             experiment.set_option(option, key, value).map_err(raygrad::Error::from)?;
         }
+    }
+    if let Some(weights) = &args.lpips {
+        experiment = experiment.lpips(weights)?;
     }
     if let Some(out) = &args.out {
         experiment = experiment.out(out);
