@@ -19,6 +19,7 @@ mod pose_error;
 mod published;
 mod scores;
 mod table;
+mod table_files;
 mod video;
 
 pub use align::{Alignment, PoseSetError, Similarity, pairwise, procrustes, umeyama};

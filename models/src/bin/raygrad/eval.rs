@@ -1,11 +1,11 @@
 //! `raygrad eval`: measures a run again, at its last checkpoint.
 
 use crate::held::HeldRun;
+use crate::print;
 use crate::progress::bar;
 use crate::surface::{Surface, SurfaceArgs};
 use clap::Args;
 use raygrad::Error;
-use raygrad::config::Settings;
 use raygrad::evaluation::{Evaluation, PublishedTable, Table, published_for};
 use raygrad::run::RunFolder;
 use raygrad::run::files::write_atomically;
@@ -71,7 +71,9 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         evaluation = measure(&mut *trainer, &folder)?;
         (step, surface, layout) = (trainer.steps_done(), None, None);
     }
-    let published = comparable(&settings, layout, &[&evaluation]);
+    let dataset = layout.map_or("planar", Layout::name);
+    let (start, scene) = (settings.start_name(), evaluation.scene.as_str());
+    let published = published_for(dataset, start.as_deref(), &[scene], &[settings.method_name()]);
     let title = format!("{}, step {step} of {}", args.held.run.display(), settings.optim.steps);
     let table = Table { title, evaluations: vec![evaluation], published };
     for (path, text) in [(&args.csv, table.views_csv()), (&args.latex, table.to_latex())] {
@@ -82,17 +84,19 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     let evaluation = &table.evaluations[0];
     if args.json {
         let (steps, published) = (settings.optim.steps, &table.published);
-        println!("{}", serde_json::to_string(&Json { step, steps, evaluation, mesh: surface.as_ref(), published })?);
+        let json = serde_json::to_string(&Json { step, steps, evaluation, mesh: surface.as_ref(), published })?;
+        print(&format!("{json}\n"))?;
         return Ok(ExitCode::SUCCESS);
     }
-    print!("{}", table.to_text());
+    let mut text = table.to_text();
     if settings.scene.is_none() {
         let errors = evaluation.cameras.views.iter().filter_map(|v| v.scores.corner_error_px);
-        println!("patches (px)  {}", errors.map(|e| format!("{e:.3}")).collect::<Vec<_>>().join("  "));
+        text += &format!("patches (px)  {}\n", errors.map(|e| format!("{e:.3}")).collect::<Vec<_>>().join("  "));
     }
     if let Some(surface) = &surface {
-        args.surface.tell(surface);
+        text += &args.surface.text(surface);
     }
+    print(&text)?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -101,11 +105,4 @@ fn measure(model: &mut dyn Training, folder: &RunFolder) -> Result<Evaluation, E
     let evaluation = model.write_evaluation(folder, &|done, all| shown.show(done, all));
     shown.finish();
     evaluation
-}
-
-/// What the papers say of these runs: their scenes, method and start.
-fn comparable(settings: &Settings, layout: Option<Layout>, runs: &[&Evaluation]) -> Vec<PublishedTable> {
-    let (dataset, start) = (layout.map_or("planar", Layout::name), settings.start_name());
-    let scenes: Vec<&str> = runs.iter().map(|r| r.scene.as_str()).collect();
-    published_for(dataset, start.as_deref(), &scenes, &[settings.method_name()])
 }

@@ -108,11 +108,12 @@ impl SurfaceArgs {
     }
 
     /// For people.
-    pub fn tell(&self, found: &Surface) {
+    pub fn text(&self, found: &Surface) -> String {
         let file = self.mesh.as_deref().map_or(String::new(), |p: &Path| format!(" in {}", p.display()));
-        println!("mesh          {} triangles{file}", found.triangles);
+        let mut text = format!("mesh          {} triangles{file}\n", found.triangles);
         if let Some(Distances { accuracy, completeness, mean }) = found.chamfer {
-            println!("chamfer       {mean:.4} (accuracy {accuracy:.4}, completeness {completeness:.4})");
+            text += &format!("chamfer       {mean:.4} (accuracy {accuracy:.4}, completeness {completeness:.4})\n");
         }
+        text
     }
 }

@@ -1,14 +1,11 @@
 //! `raygrad train`.
 
-use crate::Choice;
 use crate::progress::Progress;
-use anyhow::Context;
+use crate::{Choice, listen};
 use clap::Args;
 use raygrad::Outcome;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 #[derive(Args)]
 pub struct TrainArgs {
@@ -46,15 +43,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     if let Some(out) = &args.out {
         experiment = experiment.out(out);
     }
-    let stop = Arc::new(AtomicBool::new(false));
-    let handler = stop.clone();
-    ctrlc::set_handler(move || {
-        // The first asks for a checkpoint, the second does not wait for it.
-        if handler.swap(true, Ordering::Relaxed) {
-            std::process::exit(130);
-        }
-    })
-    .context("cannot listen for Ctrl-C")?;
+    let stop = listen()?;
     let outcome = experiment.train_observed(&mut Progress::new(), &stop)?;
     Ok(tell(&outcome))
 }
