@@ -1,7 +1,9 @@
 //! Everything that can end an experiment early.
 
 use crate::config::ConfigError;
-use crate::evaluation::ImageError;
+use crate::evaluation::{
+    CameraPlotError, CloudError, ExportError, ImageError, MeshError, MeshFileError, VideoError, WeightsError,
+};
 use crate::pictures::PictureError;
 use crate::planar::DataError;
 use crate::radiance::data::SpaceDataError;
@@ -22,6 +24,20 @@ pub enum Error {
     Space(#[from] SpaceDataError),
     #[error(transparent)]
     Image(#[from] ImageError),
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+    #[error(transparent)]
+    CameraPlot(#[from] CameraPlotError),
+    #[error(transparent)]
+    Mesh(#[from] MeshError),
+    #[error(transparent)]
+    MeshFile(#[from] MeshFileError),
+    #[error(transparent)]
+    Cloud(#[from] CloudError),
+    #[error(transparent)]
+    Export(#[from] ExportError),
+    #[error(transparent)]
+    Video(#[from] VideoError),
     #[error(transparent)]
     Scene(#[from] SceneError),
     #[error(transparent)]
@@ -51,14 +67,20 @@ pub enum Error {
 impl Error {
     /// Whether what the user gave is at fault, or the disk it goes to, and not the computation.
     pub fn is_bad_input(&self) -> bool {
-        !matches!(
-            self,
+        match self {
+            Error::Image(error) => matches!(error, ImageError::Small { .. }),
+            Error::Mesh(error) => !matches!(
+                error,
+                MeshError::Density(_) | MeshError::NotFinite { .. } | MeshError::Count { .. } | MeshError::NoSurface
+            ),
+            Error::Video(error) => matches!(error, VideoError::Empty | VideoError::Rate(_) | VideoError::Write(_)),
             Error::Picture(_)
-                | Error::Image(_)
-                | Error::Plot(_)
-                | Error::Compile(_)
-                | Error::Run(_)
-                | Error::NotFinite { .. }
-        )
+            | Error::CameraPlot(_)
+            | Error::Plot(_)
+            | Error::Compile(_)
+            | Error::Run(_)
+            | Error::NotFinite { .. } => false,
+            _ => true,
+        }
     }
 }

@@ -11,6 +11,7 @@
 
 use crate::Error;
 use crate::config::{ConfigError, DeviceChoice, Layered, Origin};
+use crate::evaluation::Lpips;
 use crate::planar::{PlanarData, Trainer};
 use crate::radiance::{Explorer, SpaceData};
 use crate::run::RunFolder;
@@ -30,6 +31,7 @@ pub struct Experiment {
     pub layered: Layered,
     warp: Option<Arc<dyn Warp>>,
     device: Option<Device>,
+    lpips: Option<Arc<Lpips>>,
     out: Option<PathBuf>,
     resume: bool,
 }
@@ -64,7 +66,17 @@ impl Observer for Quiet {}
 impl Experiment {
     /// A built-in preset, or a file if the name ends in `.toml`.
     pub fn preset(name: &str) -> Result<Experiment, Error> {
-        Ok(Experiment { layered: Layered::load(name)?, warp: None, device: None, out: None, resume: false })
+        Ok(Experiment::of(Layered::load(name)?))
+    }
+
+    /// An experiment of these settings.
+    pub fn of(layered: Layered) -> Experiment {
+        Experiment { layered, warp: None, device: None, lpips: None, out: None, resume: false }
+    }
+
+    /// The experiment that a run folder holds; [`Experiment::restored`] is its model.
+    pub fn of_run(folder: &Path) -> Result<Experiment, Error> {
+        Ok(Experiment::of(RunFolder::settings_of_run(folder)?).out(folder).resume(true))
     }
 
     /// Sets one value, as in `optim.steps=500`.
@@ -98,6 +110,12 @@ impl Experiment {
     pub fn device(mut self, device: Device) -> Experiment {
         self.device = Some(device);
         self
+    }
+
+    /// Weights of LPIPS, to measure the pictures of an experiment in space with.
+    pub fn lpips(mut self, weights: &Path) -> Result<Experiment, Error> {
+        self.lpips = Some(Arc::new(Lpips::load(weights)?));
+        Ok(self)
     }
 
     /// The run folder; by default the first free one of `runs/NAME`, `runs/NAME-2`, ...
@@ -140,7 +158,37 @@ impl Experiment {
         let settings = &self.layered.settings;
         let data = SpaceData::load(&self.layered, &|_, _| {})?;
         let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings, data.scene.train.len()));
-        Explorer::new(settings, data, warp, self.open()?)
+        let mut explorer = Explorer::new(settings, data, warp, self.open()?)?;
+        explorer.lpips = self.lpips.clone();
+        Ok(explorer)
+    }
+
+    /// The model of the last checkpoint of the run in the folder that [`Experiment::out`] names.
+    pub fn restored(&self) -> Result<Box<dyn Training>, Error> {
+        if self.layered.settings.scene.is_some() {
+            return Ok(Box::new(self.restored_explorer()?));
+        }
+        let mut trainer = self.trainer()?;
+        self.restore(&mut trainer)?;
+        Ok(Box::new(trainer))
+    }
+
+    /// The same for an experiment in space.
+    pub fn restored_explorer(&self) -> Result<Explorer, Error> {
+        let mut explorer = self.explorer()?;
+        self.restore(&mut explorer)?;
+        Ok(explorer)
+    }
+
+    fn restore(&self, model: &mut dyn Training) -> Result<Checkpoint, Error> {
+        let checkpoint = Checkpoint::load(&self.folder(), &model.learner().checkpoint_shapes())?;
+        model.restore(&checkpoint)?;
+        Ok(checkpoint)
+    }
+
+    /// The run folder.
+    fn folder(&self) -> PathBuf {
+        self.out.clone().unwrap_or_else(|| RunFolder::default_path(&self.layered.name, self.resume))
     }
 
     fn open(&self) -> Result<Device, Error> {
@@ -155,7 +203,7 @@ impl Experiment {
     pub fn train_observed(&self, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<Outcome, Error> {
         self.layered.validate()?;
         let settings = &self.layered.settings;
-        let path = self.out.clone().unwrap_or_else(|| RunFolder::default_path(&self.layered.name, self.resume));
+        let path = self.folder();
         // Refuse a folder before the work of compiling, and again look at it before the first write.
         let mut folder = match self.resume {
             true => RunFolder::reopen(&path, settings)?,
@@ -164,8 +212,7 @@ impl Experiment {
         let mut trainer = self.training()?;
         let mut run = Run { metrics: Metrics::default(), seconds: 0.0, begun: Instant::now() };
         if self.resume {
-            let checkpoint = Checkpoint::load(&path, &trainer.learner().checkpoint_shapes())?;
-            trainer.restore(&checkpoint)?;
+            let checkpoint = self.restore(&mut *trainer)?;
             (run.metrics.steps, run.seconds) = (checkpoint.steps, checkpoint.seconds);
         } else {
             folder.start(settings)?;

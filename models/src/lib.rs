@@ -42,6 +42,7 @@ pub mod radiance;
 pub mod report;
 pub mod run;
 pub mod scene;
+pub mod sweep;
 pub mod testing;
 pub mod training;
 pub mod warps;

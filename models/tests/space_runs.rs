@@ -83,14 +83,27 @@ fn a_run_leaves_poses_views_and_scores() {
     tiny(&[], &run).train().unwrap();
     let json = |name: &str| -> Value { serde_json::from_slice(&std::fs::read(run.join(name)).unwrap()).unwrap() };
     let scores = json("evaluation.json");
-    for key in ["rotation_error_deg", "translation_error_x100", "psnr_db", "ssim", "refined_psnr_db", "refined_ssim"] {
-        assert!(scores[key].as_f64().unwrap().is_finite(), "{key}: {scores}");
+    assert_eq!((&scores["scene"], &scores["method"]), (&Value::from("builtin"), &Value::from("l2g")));
+    for (part, keys, views) in [
+        ("cameras", &["rotation_error_deg", "translation_error_x100"][..], 5),
+        ("before", &["psnr_db", "ssim", "depth_error"], 2),
+        ("after", &["psnr_db", "ssim", "depth_error"], 2),
+    ] {
+        let all = scores[part]["views"].as_array().unwrap();
+        assert_eq!(all.len(), views, "{part}");
+        for key in keys {
+            let mean = all.iter().map(|v| v[key].as_f64().unwrap()).sum::<f64>() / views as f64;
+            let found = scores[part]["mean"][key].as_f64().unwrap();
+            assert!((found - mean).abs() < 1e-9 && found > 0.0, "{part} {key}: {scores}");
+        }
     }
-    assert_eq!(scores["views"].as_array().unwrap().len(), 2);
     assert_eq!(json("poses.json")["aligned"].as_array().unwrap().len(), 5);
     let metrics = json("metrics.json");
     assert_eq!(metrics["steps"].as_array().unwrap().len(), 3);
-    assert!(metrics["final"]["rotation_error_deg"].as_f64().unwrap() > 0.0);
+    assert_eq!(metrics["final"]["rotation_error_deg"], scores["cameras"]["mean"]["rotation_error_deg"]);
+    let plot = std::fs::read_to_string(run.join("cameras.svg")).unwrap();
+    // Before and after: a frustum of eight lines for either pose of five cameras, and a line between the two.
+    assert_eq!(plot.matches("<polyline").count(), 2 * 5 * (2 * 8 + 1));
     for name in
         ["initial_poses.json", "report.html", "test/000.png", "test/001_depth.png", "test_views.png", "training.png"]
     {

@@ -36,6 +36,8 @@ pub enum ConfigError {
     Value { origin: Origin, key: String, message: String },
     #[error("{file}: missing `{key}`; add it, or build on a preset with `base = \"planar-l2g\"`")]
     Missing { file: String, key: String },
+    #[error("{file}: missing `presets`, the list of what to run")]
+    MissingOfSweep { file: String },
     #[error("{origin}: `base` chains back to `{name}`: a file cannot build on itself")]
     Cycle { origin: Origin, name: String },
     #[error("`--set {text}`: expected `--set section.key=value`, for example `--set optim.steps=1000`")]

@@ -66,6 +66,14 @@ impl Layered {
         ConfigError::Value { origin: self.origin(key), key: key.to_string(), message: message.into() }
     }
 
+    /// Sets a value that a file sets.
+    pub(super) fn apply(&mut self, key: &str, value: Value, origin: Origin) -> Result<(), ConfigError> {
+        if !self.has(key) {
+            return Err(unknown(origin, key, self.origins.keys()));
+        }
+        self.put(key, value, origin)
+    }
+
     fn has(&self, key: &str) -> bool {
         self.origins.contains_key(key)
     }
@@ -102,13 +110,7 @@ fn load(name: &str, below: &mut Vec<String>) -> Result<Layered, ConfigError> {
             return Err(ConfigError::UnknownPreset { name: name.to_string(), nearest });
         }
     };
-    let lines = LineIndex::new(&file, &text);
-    let document = DeTable::parse(&text).map_err(|e| ConfigError::Syntax {
-        origin: lines.at(e.span().map_or(0, |s| s.start)),
-        message: e.message().to_string(),
-    })?;
-    let mut leaves = vec![];
-    flatten("", document.get_ref(), &lines, &mut leaves);
+    let mut leaves = leaves(&file, &text)?;
     let base = leaves.iter().position(|l| l.key == "base").map(|i| leaves.remove(i));
     below.push(name.to_string());
     match base {
@@ -123,10 +125,7 @@ fn load(name: &str, below: &mut Vec<String>) -> Result<Layered, ConfigError> {
             }
             let mut layered = load(base_name, below)?;
             for leaf in leaves {
-                if !layered.has(&leaf.key) {
-                    return Err(unknown(leaf.origin, &leaf.key, layered.origins.keys()));
-                }
-                layered.put(&leaf.key, leaf.value, leaf.origin)?;
+                layered.apply(&leaf.key, leaf.value, leaf.origin)?;
             }
             layered.name = label;
             Ok(layered)
@@ -159,18 +158,26 @@ fn root(name: String, file: String, leaves: Vec<Leaf>) -> Result<Layered, Config
 fn known_keys(space: bool) -> Vec<String> {
     let root = |p: &&Preset| !p.text.contains("\nbase ") && p.text.contains("\n[scene]") == space;
     let text = PRESETS.iter().find(root).map_or("", |p| p.text);
-    let lines = LineIndex::new("", text);
-    let mut leaves = vec![];
-    if let Ok(document) = DeTable::parse(text) {
-        flatten("", document.get_ref(), &lines, &mut leaves);
-    }
-    leaves.into_iter().map(|l| l.key).collect()
+    leaves("", text).unwrap_or_default().into_iter().map(|l| l.key).collect()
 }
 
-struct Leaf {
-    key: String,
-    value: Value,
-    origin: Origin,
+/// A value of a file, under the names of all tables that it is in.
+pub(super) struct Leaf {
+    pub key: String,
+    pub value: Value,
+    pub origin: Origin,
+}
+
+/// Everything that a file of this name and content sets.
+pub(super) fn leaves(file: &str, text: &str) -> Result<Vec<Leaf>, ConfigError> {
+    let lines = LineIndex::new(file, text);
+    let document = DeTable::parse(text).map_err(|e| ConfigError::Syntax {
+        origin: lines.at(e.span().map_or(0, |s| s.start)),
+        message: e.message().to_string(),
+    })?;
+    let mut leaves = vec![];
+    flatten("", document.get_ref(), &lines, &mut leaves);
+    Ok(leaves)
 }
 
 fn flatten(prefix: &str, table: &DeTable, lines: &LineIndex, into: &mut Vec<Leaf>) {
@@ -234,7 +241,7 @@ fn parse(table: &Table) -> Result<Settings, (String, String)> {
     })
 }
 
-fn unknown<'a>(origin: Origin, key: &str, known: impl Iterator<Item = &'a String>) -> ConfigError {
+pub(super) fn unknown<'a>(origin: Origin, key: &str, known: impl Iterator<Item = &'a String>) -> ConfigError {
     ConfigError::UnknownKey { origin, key: key.to_string(), nearest: nearest(key, known.map(String::as_str)) }
 }
 

@@ -5,11 +5,14 @@
 
 mod error;
 mod layers;
+mod names;
 mod presets;
 mod settings;
+mod sweep;
 mod validate;
 
 pub use error::{ConfigError, Origin};
 pub use layers::{Layered, nearest};
 pub use presets::{PRESETS, Preset};
 pub use settings::*;
+pub use sweep::{Sweep, SweepCell};

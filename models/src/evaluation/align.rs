@@ -111,6 +111,11 @@ impl Similarity {
         self.rotation * point * self.scale + self.translation
     }
 
+    /// A point of the reference frame in the learned frame.
+    pub fn point_to_learned(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        self.rotation.transpose() * (point - self.translation) / self.scale
+    }
+
     /// Learned poses (world to camera) in the reference frame.
     pub fn align(&self, predicted: &[Pose]) -> Vec<Pose> {
         predicted.iter().map(|p| moved(p, &self.rotation.transpose(), self.apply(&p.center()))).collect()
@@ -118,8 +123,7 @@ impl Similarity {
 
     /// A pose of the reference frame, say of a test view, in the learned frame.
     pub fn to_learned(&self, reference: &Pose) -> Pose {
-        let center = self.rotation.transpose() * (reference.center() - self.translation) / self.scale;
-        moved(reference, &self.rotation, center)
+        moved(reference, &self.rotation, self.point_to_learned(&reference.center()))
     }
 }
 

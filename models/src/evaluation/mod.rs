@@ -19,6 +19,7 @@ mod pose_error;
 mod published;
 mod scores;
 mod table;
+mod table_files;
 mod video;
 
 pub use align::{Alignment, PoseSetError, Similarity, pairwise, procrustes, umeyama};
@@ -32,7 +33,7 @@ pub use mesh::{DensityError, Mesh, MeshError, MeshOptions};
 pub use mesh_reader::MeshFileError;
 pub use novel_path::{FRAMES, anchor, novel_view_path};
 pub use pose_error::{PoseErrors, pose_errors, rotation_angle};
-pub use published::{PublishedRow, PublishedTable, published, published_of};
-pub use scores::{Evaluation, Measured, Metric, Scores, Stage, ViewScores};
-pub use table::{Row, Table};
+pub use published::{PublishedRow, PublishedTable, published, published_for, published_of};
+pub use scores::{Evaluation, Measured, Metric, SUCCESS_PX, Scores, Stage, ViewScores};
+pub use table::{Cell, Row, Table};
 pub use video::{Video, VideoError, write_video, write_video_with};

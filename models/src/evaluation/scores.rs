@@ -15,16 +15,28 @@ pub enum Metric {
     Lpips,
     /// Mean absolute, in units of the data set.
     DepthError,
+    /// In the plane: mean distance between estimated and true corners of the patches.
+    CornerErrorPx,
+    /// In the plane: PSNR of all patches together.
+    PatchPsnrDb,
+    /// In the plane: 1 where the corner error is below [`SUCCESS_PX`], else 0; over several runs, their share.
+    Success,
 }
 
+/// Corner error in pixels below which patches count as registered (INN's supplement).
+pub const SUCCESS_PX: f64 = 5.0;
+
 impl Metric {
-    pub const ALL: [Metric; 6] = [
+    pub const ALL: [Metric; 9] = [
         Metric::RotationErrorDeg,
         Metric::TranslationErrorX100,
         Metric::PsnrDb,
         Metric::Ssim,
         Metric::Lpips,
         Metric::DepthError,
+        Metric::CornerErrorPx,
+        Metric::PatchPsnrDb,
+        Metric::Success,
     ];
 
     /// Its name in files.
@@ -36,6 +48,9 @@ impl Metric {
             Metric::Ssim => "ssim",
             Metric::Lpips => "lpips",
             Metric::DepthError => "depth_error",
+            Metric::CornerErrorPx => "corner_error_px",
+            Metric::PatchPsnrDb => "patch_psnr_db",
+            Metric::Success => "success",
         }
     }
 
@@ -48,25 +63,29 @@ impl Metric {
             Metric::Ssim => "SSIM",
             Metric::Lpips => "LPIPS",
             Metric::DepthError => "depth error",
+            Metric::CornerErrorPx => "corner error (px)",
+            Metric::PatchPsnrDb => "patch PSNR (dB)",
+            Metric::Success => "success (share)",
         }
     }
 
     /// Digits after the point.
     pub fn decimals(self) -> usize {
         match self {
-            Metric::PsnrDb => 2,
+            Metric::PsnrDb | Metric::PatchPsnrDb | Metric::Success => 2,
             _ => 3,
         }
     }
 
     /// Whether a smaller number is a better one.
     pub fn lower_is_better(self) -> bool {
-        !matches!(self, Metric::PsnrDb | Metric::Ssim)
+        !matches!(self, Metric::PsnrDb | Metric::Ssim | Metric::PatchPsnrDb | Metric::Success)
     }
 
-    /// Whether it is of the training cameras, and so the same before and after refinement of test poses.
-    pub fn is_of_poses(self) -> bool {
-        matches!(self, Metric::RotationErrorDeg | Metric::TranslationErrorX100)
+    /// Whether it is of test views, and so differs before and after refinement of their poses; the others are of the
+    /// training cameras or patches.
+    pub fn is_of_views(self) -> bool {
+        matches!(self, Metric::PsnrDb | Metric::Ssim | Metric::Lpips | Metric::DepthError)
     }
 }
 
@@ -86,6 +105,12 @@ pub struct Scores {
     pub lpips: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub depth_error: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub corner_error_px: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub patch_psnr_db: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub success: Option<f64>,
 }
 
 impl Scores {
@@ -97,6 +122,9 @@ impl Scores {
             Metric::Ssim => self.ssim,
             Metric::Lpips => self.lpips,
             Metric::DepthError => self.depth_error,
+            Metric::CornerErrorPx => self.corner_error_px,
+            Metric::PatchPsnrDb => self.patch_psnr_db,
+            Metric::Success => self.success,
         }
     }
 
@@ -113,6 +141,9 @@ impl Scores {
             ssim: of(Metric::Ssim),
             lpips: of(Metric::Lpips),
             depth_error: of(Metric::DepthError),
+            corner_error_px: of(Metric::CornerErrorPx),
+            patch_psnr_db: of(Metric::PatchPsnrDb),
+            success: of(Metric::Success),
         }
     }
 }
@@ -120,7 +151,7 @@ impl Scores {
 /// Scores of one view.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ViewScores {
-    /// Name of the view's picture.
+    /// Name of the view's picture, or of a patch.
     pub view: String,
     #[serde(flatten)]
     pub scores: Scores,
@@ -163,7 +194,8 @@ impl Stage {
 pub struct Evaluation {
     pub scene: String,
     pub method: String,
-    /// Pose errors of the training cameras; empty where there is no reference to compare with.
+    /// Pose errors of the training cameras, or corner errors of the patches of a picture; empty where there is no reference
+    /// to compare with.
     pub cameras: Measured,
     /// Test views at the poses the alignment gives.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -174,6 +206,12 @@ pub struct Evaluation {
 }
 
 impl Evaluation {
+    /// As JSON.
+    pub fn to_json(&self) -> String {
+        // Numbers, strings and lists always have a JSON form.
+        serde_json::to_string_pretty(self).unwrap_or_default()
+    }
+
     /// The views of a stage.
     pub fn stage(&self, stage: Stage) -> Option<&Measured> {
         match stage {
@@ -205,11 +243,11 @@ mod tests {
         }
         let all: Scores = serde_json::from_str(
             r#"{"rotation_error_deg": 1, "translation_error_x100": 2, "psnr_db": 3,
-                "ssim": 4, "lpips": 5, "depth_error": 6}"#,
+                "ssim": 4, "lpips": 5, "depth_error": 6, "corner_error_px": 7, "patch_psnr_db": 8, "success": 9}"#,
         )
         .unwrap();
         let values: Vec<f64> = Metric::ALL.iter().filter_map(|m| all.get(*m)).collect();
-        assert_eq!(values, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
+        assert_eq!(values, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0]);
         let json = serde_json::to_value(all).unwrap();
         assert!(Metric::ALL.iter().all(|m| json.get(m.key()).is_some()));
     }

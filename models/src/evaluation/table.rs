@@ -1,9 +1,9 @@
-//! Results as tables in the papers' layout: a row for each metric and method, a column for each scene, and the mean.
+//! Results as tables in the papers' layout: a row for each metric and method, a column for each scene, and the mean. Of
+//! several runs of one method on one scene a cell holds the mean and the standard deviation.
 
 use super::published::PublishedTable;
-use super::scores::{Evaluation, Measured, Metric, Scores, Stage};
+use super::scores::{Evaluation, Metric, Stage};
 use serde::{Deserialize, Serialize};
-use std::fmt::Write;
 
 /// Our runs, and tables of papers to print beside them.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -12,6 +12,25 @@ pub struct Table {
     pub evaluations: Vec<Evaluation>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub published: Vec<PublishedTable>,
+}
+
+/// One number of a table.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Cell {
+    pub mean: f64,
+    /// Standard deviation over runs, with n - 1; nothing for one run.
+    pub spread: Option<f64>,
+}
+
+impl Cell {
+    /// Of several runs; nothing of none.
+    fn of(values: &[f64]) -> Option<Cell> {
+        let n = values.len() as f64;
+        let mean = values.iter().sum::<f64>() / n;
+        let squares = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>();
+        let spread = (values.len() > 1).then(|| (squares / (n - 1.0)).sqrt());
+        (!values.is_empty()).then_some(Cell { mean, spread })
+    }
 }
 
 /// One line of a table.
@@ -25,13 +44,13 @@ pub struct Row {
     pub source: Option<String>,
     pub verified: bool,
     /// One for each of [`Table::scenes`].
-    pub values: Vec<Option<f64>>,
+    pub values: Vec<Option<Cell>>,
     /// Over the scenes that have a value; of a paper that only has means, its mean.
-    pub mean: Option<f64>,
+    pub mean: Option<Cell>,
 }
 
 impl Row {
-    fn heading(&self) -> String {
+    pub(super) fn heading(&self) -> String {
         match self.stage {
             Some(stage) => format!("{}, {}", self.metric.heading(), stage.name()),
             None => self.metric.heading().to_string(),
@@ -39,20 +58,17 @@ impl Row {
     }
 
     /// The method, with the paper it is from and a mark where that is not verified.
-    fn label(&self) -> String {
+    pub(super) fn label(&self) -> String {
         match &self.source {
             Some(source) => format!("{} [{source}]{}", self.method, if self.verified { "" } else { " *" }),
             None => self.method.clone(),
         }
     }
 
-    fn cells(&self) -> impl Iterator<Item = Option<f64>> {
+    pub(super) fn cells(&self) -> impl Iterator<Item = Option<Cell>> {
         self.values.iter().copied().chain([self.mean])
     }
 }
-
-/// Below a table with such rows.
-const NOTE: &str = "* quoted, not verified against the paper";
 
 impl Table {
     /// The columns: scenes in the order of the runs, or those of the papers where there are no runs.
@@ -85,7 +101,7 @@ impl Table {
         let mut rows = vec![];
         for metric in Metric::ALL {
             let stages: &[Option<Stage>] =
-                if metric.is_of_poses() { &[None] } else { &[Some(Stage::Before), Some(Stage::After)] };
+                if metric.is_of_views() { &[Some(Stage::Before), Some(Stage::After)] } else { &[None] };
             for stage in stages {
                 rows.extend(methods.iter().filter_map(|m| self.our_row(metric, *stage, m, &scenes)));
                 rows.extend(self.published.iter().flat_map(|t| published_rows(t, metric, *stage, &scenes)));
@@ -95,126 +111,26 @@ impl Table {
     }
 
     fn our_row(&self, metric: Metric, stage: Option<Stage>, method: &str, scenes: &[String]) -> Option<Row> {
-        let value = |scene: &String| {
-            let run = self.evaluations.iter().find(|e| e.method == method && e.scene == *scene)?;
-            let measured = stage.map_or(Some(&run.cameras), |s| run.stage(s))?;
-            measured.mean.get(metric)
+        let cell = |scene: &String| {
+            let runs = self.evaluations.iter().filter(|e| e.method == method && e.scene == *scene);
+            let value = |run: &Evaluation| stage.map_or(Some(&run.cameras), |s| run.stage(s))?.mean.get(metric);
+            Cell::of(&runs.filter_map(value).collect::<Vec<f64>>())
         };
-        let values: Vec<Option<f64>> = scenes.iter().map(value).collect();
+        let values: Vec<Option<Cell>> = scenes.iter().map(cell).collect();
         let mean = mean(&values)?;
         Some(Row { metric, stage, method: method.into(), source: None, verified: true, values, mean: Some(mean) })
-    }
-
-    /// For a terminal.
-    pub fn to_text(&self) -> String {
-        let mut lines = vec![self.head(["", "method"])];
-        let rows = self.rows();
-        let mut last = String::new();
-        for row in &rows {
-            let heading = row.heading();
-            let shown = if heading == last { String::new() } else { heading.clone() };
-            last = heading;
-            let cells = row.cells().map(|v| number(row.metric, v));
-            lines.push([shown, row.label()].into_iter().chain(cells).collect());
-        }
-        let mut out = if self.title.is_empty() { String::new() } else { format!("{}\n", self.title) };
-        out += &aligned(&lines);
-        if rows.iter().any(|r| !r.verified) {
-            out += &format!("{NOTE}\n");
-        }
-        out
-    }
-
-    /// Comma-separated, with a head line.
-    pub fn to_csv(&self) -> String {
-        let mut out = csv_line(&self.head(["metric", "stage", "method", "source", "verified"]));
-        for row in self.rows() {
-            let stage = row.stage.map_or("", Stage::name).to_string();
-            let source = row.source.clone().unwrap_or_else(|| "ours".into());
-            let head = [row.metric.key().to_string(), stage, row.method.clone(), source, row.verified.to_string()];
-            let cells = row.cells().map(|v| v.map(|v| v.to_string()).unwrap_or_default());
-            out += &csv_line(&head.into_iter().chain(cells).collect::<Vec<String>>());
-        }
-        out
-    }
-
-    /// Every view of our runs, comma-separated: scene, method, stage (`cameras`, `before`, `after`), view, metrics.
-    pub fn views_csv(&self) -> String {
-        let metrics = Metric::ALL.iter().map(|m| m.key().to_string());
-        let head = ["scene", "method", "stage", "view"].map(String::from);
-        let mut out = csv_line(&head.into_iter().chain(metrics).collect::<Vec<String>>());
-        let mut line = |run: &Evaluation, stage: &str, view: &str, scores: &Scores| {
-            let head = [run.scene.as_str(), run.method.as_str(), stage, view].map(String::from);
-            let values = Metric::ALL.iter().map(|m| scores.get(*m).map(|v| v.to_string()).unwrap_or_default());
-            out += &csv_line(&head.into_iter().chain(values).collect::<Vec<String>>());
-        };
-        for run in &self.evaluations {
-            let stages =
-                [("cameras", Some(&run.cameras)), ("before", run.before.as_ref()), ("after", run.after.as_ref())];
-            let present: Vec<(&str, &Measured)> = stages.into_iter().filter_map(|(n, m)| Some((n, m?))).collect();
-            for (stage, measured) in present.into_iter().filter(|(_, m)| !m.views.is_empty()) {
-                measured.views.iter().for_each(|v| line(run, stage, &v.view, &v.scores));
-                line(run, stage, "mean", &measured.mean);
-            }
-        }
-        out
-    }
-
-    /// A LaTeX `tabular`, the best of each group and column bold.
-    pub fn to_latex(&self) -> String {
-        let rows = self.rows();
-        let columns = "r".repeat(self.scenes().len() + 1);
-        let mut out = format!("\\begin{{tabular}}{{ll{columns}}}\n\\hline\n");
-        let head = self.head(["", "method"]);
-        out += &format!("{} \\\\\n", head.iter().map(|h| latex(h)).collect::<Vec<String>>().join(" & "));
-        let mut last = String::new();
-        for row in &rows {
-            let heading = row.heading();
-            let first = heading != last;
-            if first {
-                out += "\\hline\n";
-            }
-            let group: Vec<&Row> = rows.iter().filter(|r| (r.metric, r.stage) == (row.metric, row.stage)).collect();
-            let cells = row.cells().enumerate().map(|(i, v)| {
-                let text = number(row.metric, v);
-                if is_best(row.metric, v, group.iter().map(|r| r.cells().nth(i).flatten())) {
-                    format!("\\textbf{{{text}}}")
-                } else {
-                    text
-                }
-            });
-            let cells: Vec<String> = cells.collect();
-            let shown = if first { latex(&heading) } else { String::new() };
-            let _ = writeln!(out, "{shown} & {} & {} \\\\", latex(&row.label()), cells.join(" & "));
-            last = heading;
-        }
-        out += "\\hline\n\\end{tabular}\n";
-        if rows.iter().any(|r| !r.verified) {
-            out += &format!("% {NOTE}\n");
-        }
-        out
-    }
-
-    /// Title, runs with every view, and the papers' tables; reads back with serde.
-    pub fn to_json(&self) -> String {
-        // Numbers, strings and lists always have a JSON form.
-        serde_json::to_string_pretty(self).unwrap_or_default()
-    }
-
-    fn head<const N: usize>(&self, first: [&str; N]) -> Vec<String> {
-        first.map(String::from).into_iter().chain(self.scenes()).chain(["mean".to_string()]).collect()
     }
 }
 
 fn published_rows(table: &PublishedTable, metric: Metric, stage: Option<Stage>, scenes: &[String]) -> Vec<Row> {
     let rows = table.rows.iter().filter(|r| r.metric == metric && r.stage == stage);
     let shown = rows.filter_map(|r| {
-        let value =
-            |scene: &String| table.scenes.iter().position(|s| s == scene).and_then(|i| r.values.get(i).copied());
-        let values: Vec<Option<f64>> = scenes.iter().map(value).collect();
+        let cell = |mean: f64| Cell { mean, spread: r.spread };
+        let value = |scene: &String| table.scenes.iter().position(|s| s == scene).and_then(|i| r.values.get(i));
+        let values: Vec<Option<Cell>> = scenes.iter().map(|s| value(s).map(|v| cell(*v))).collect();
         let all = values.iter().flatten().count() == table.scenes.len();
         // A mean over other scenes than those shown would not compare with ours.
-        let mean = if all { Some(r.mean) } else { mean(&values) };
+        let mean = if all { Some(cell(r.mean)) } else { mean(&values) };
         let whole = if table.scenes.is_empty() { ", all scenes" } else { "" };
         let source = Some(format!("{}, {}{whole}", table.paper, table.table));
         mean.is_some().then(|| Row {
@@ -230,149 +146,12 @@ fn published_rows(table: &PublishedTable, metric: Metric, stage: Option<Stage>, 
     shown.collect()
 }
 
-fn mean(values: &[Option<f64>]) -> Option<f64> {
-    let known: Vec<f64> = values.iter().flatten().copied().collect();
-    (!known.is_empty()).then(|| known.iter().sum::<f64>() / known.len() as f64)
-}
-
-fn is_best(metric: Metric, value: Option<f64>, group: impl Iterator<Item = Option<f64>>) -> bool {
-    let group: Vec<f64> = group.flatten().collect();
-    let best = if metric.lower_is_better() { f64::min } else { f64::max };
-    group.len() > 1 && value.is_some() && value == group.into_iter().reduce(best)
-}
-
-fn number(metric: Metric, value: Option<f64>) -> String {
-    value.map_or("-".into(), |v| format!("{v:.*}", metric.decimals()))
-}
-
-/// Columns two spaces apart; the first two to the left, numbers to the right.
-fn aligned(lines: &[Vec<String>]) -> String {
-    let columns = lines.iter().map(Vec::len).max().unwrap_or(0);
-    let width = |i: usize| lines.iter().filter_map(|l| l.get(i)).map(|c| c.chars().count()).max().unwrap_or(0);
-    let widths: Vec<usize> = (0..columns).map(width).collect();
-    let mut out = String::new();
-    for line in lines {
-        let cells = line.iter().enumerate().map(|(i, cell)| match i {
-            0 | 1 => format!("{cell:<0$}", widths[i]),
-            _ => format!("{cell:>0$}", widths[i]),
-        });
-        let _ = writeln!(out, "{}", cells.collect::<Vec<String>>().join("  ").trim_end());
-    }
-    out
-}
-
-fn csv_line(fields: &[String]) -> String {
-    let quoted = |f: &String| {
-        if f.contains([',', '"', '\n', '\r']) { format!("\"{}\"", f.replace('"', "\"\"")) } else { f.clone() }
-    };
-    format!("{}\n", fields.iter().map(quoted).collect::<Vec<String>>().join(","))
-}
-
-/// Text with the characters LaTeX takes for commands made plain.
-fn latex(text: &str) -> String {
-    let plain = |c: char| match c {
-        '\\' => "\\textbackslash{}".to_string(),
-        '~' => "\\textasciitilde{}".to_string(),
-        '^' => "\\textasciicircum{}".to_string(),
-        '&' | '%' | '$' | '#' | '_' | '{' | '}' => format!("\\{c}"),
-        other => other.to_string(),
-    };
-    text.chars().map(plain).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::super::published::{PublishedRow, published_of};
-    use super::super::scores::ViewScores;
-    use super::*;
-
-    fn run(scene: &str, method: &str, degrees: f64, psnr: [f64; 2]) -> Evaluation {
-        let view = |view: &str, scores| ViewScores { view: view.into(), scores };
-        let camera = Scores { rotation_error_deg: Some(degrees), ..Scores::default() };
-        let picture = |psnr_db| Scores { psnr_db: Some(psnr_db), ..Scores::default() };
-        Evaluation {
-            scene: scene.into(),
-            method: method.into(),
-            cameras: Measured::new(vec![view("cam, 1", camera)]),
-            before: Some(Measured::new(psnr.map(|p| view("t", picture(p))).to_vec())),
-            after: None,
-        }
-    }
-
-    fn table() -> Table {
-        let row = |metric, stage, method: &str, verified, values: [f64; 2]| PublishedRow {
-            metric,
-            stage,
-            method: method.into(),
-            verified,
-            mean: (values[0] + values[1]) / 2.0,
-            values: values.to_vec(),
-        };
-        let published = PublishedTable {
-            paper: "P".into(),
-            table: "T".into(),
-            dataset: "d".into(),
-            start: "identity".into(),
-            scenes: vec!["fern".into(), "other".into()],
-            rows: vec![row(Metric::RotationErrorDeg, None, "barf", false, [0.125, 7.0])],
-        };
-        Table {
-            title: "two scenes".into(),
-            evaluations: vec![run("fern", "l2g", 0.25, [20.0, 22.0]), run("a_b", "l2g", 0.75, [30.0, 31.0])],
-            published: vec![published],
-        }
-    }
-
-    #[test]
-    fn text_has_scenes_as_columns_and_means() {
-        let expected = "two scenes\n\
-                                         method         fern    a_b   mean\n\
-                        rotation (deg)     l2g           0.250  0.750  0.500\n\
-                                           barf [P, T] * 0.125      -  0.125\n";
-        let squeeze =
-            |s: &str| s.lines().map(|l| l.split_whitespace().collect::<Vec<_>>().join(" ")).collect::<Vec<_>>();
-        let text = table().to_text();
-        assert_eq!(squeeze(&text)[..4], squeeze(expected)[..4], "{text}");
-        assert!(text.contains("PSNR (dB), before") && text.contains("21.00  30.50  25.75"), "{text}");
-        assert!(text.ends_with(&format!("{NOTE}\n")));
-        let lines: Vec<&str> = text.lines().skip(1).take(3).collect();
-        assert!(lines.iter().all(|l| l.len() == lines[0].len()), "columns do not line up:\n{text}");
-    }
-
-    #[test]
-    fn csv_quotes_and_latex_escapes() {
-        let csv = table().to_csv();
-        assert!(csv.starts_with("metric,stage,method,source,verified,fern,a_b,mean\n"), "{csv}");
-        assert!(csv.contains("rotation_error_deg,,barf,\"P, T\",false,0.125,,0.125\n"), "{csv}");
-        let views = table().views_csv();
-        assert!(views.contains("fern,l2g,cameras,\"cam, 1\",0.25,,,,,\n"), "{views}");
-        assert!(views.contains("fern,l2g,before,mean,,,21,,,\n"), "{views}");
-        let latex = table().to_latex();
-        assert!(latex.contains("a\\_b") && latex.contains("\\textbf{0.125}"), "{latex}");
-        assert!(latex.starts_with("\\begin{tabular}{llrrr}\n") && latex.contains("\\end{tabular}"), "{latex}");
-    }
-
-    #[test]
-    fn json_reads_back_and_has_the_fields() {
-        let json = table().to_json();
-        assert_eq!(serde_json::from_str::<Table>(&json).unwrap(), table());
-        let value: serde_json::Value = serde_json::from_str(&json).unwrap();
-        assert_eq!(value["evaluations"][0]["before"]["mean"]["psnr_db"], 21.0);
-        assert_eq!(value["evaluations"][0]["before"]["views"][1]["psnr_db"], 22.0);
-        assert_eq!(value["evaluations"][1]["cameras"]["mean"]["rotation_error_deg"], 0.75);
-    }
-
-    #[test]
-    fn papers_alone_make_a_table_and_nothing_makes_an_empty_one() {
-        let papers = Table { published: published_of("llff"), ..Table::default() };
-        assert_eq!(papers.scenes()[0], "fern");
-        let text = papers.to_text();
-        assert!(text.contains("inn [INN, Supplement, Table 7]") && text.contains("0.310"), "{text}");
-        // Of a table of eight scenes, two are shown: the mean is theirs.
-        let ours = Table { evaluations: vec![run("fern", "l2g", 0.2, [20.0; 2])], ..papers };
-        let row = ours.rows().into_iter().find(|r| r.method == "inn" && r.metric == Metric::RotationErrorDeg).unwrap();
-        assert_eq!((row.values, row.mean), (vec![Some(0.19)], Some(0.19)));
-        assert_eq!(Table::default().rows(), []);
-        assert_eq!(Table::default().to_text(), "  method  mean\n");
+/// Over scenes. It has a spread over runs only where it is of one scene.
+fn mean(values: &[Option<Cell>]) -> Option<Cell> {
+    let known: Vec<Cell> = values.iter().flatten().copied().collect();
+    match known[..] {
+        [] => None,
+        [only] => Some(only),
+        _ => Some(Cell { mean: known.iter().map(|c| c.mean).sum::<f64>() / known.len() as f64, spread: None }),
     }
 }

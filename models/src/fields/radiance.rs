@@ -71,20 +71,36 @@ impl RadianceField {
     /// given the progress of training from 0 to 1. `noise`, if any, is added to the density before its activation.
     #[track_caller]
     pub fn at(&self, points: &Tensor, directions: &Tensor, progress: &Tensor, noise: Option<&Tensor>) -> Radiance {
-        let hidden = self.trunk.apply(&self.encode(points, self.bands, progress));
+        let hidden = self.hidden(points, progress);
         let mut raw = self.density.apply(&hidden);
         if let Some(noise) = noise {
             raw = raw + noise;
         }
-        let density = match self.activation {
-            Density::Softplus => raw.softplus(1.0),
-            Density::Relu => raw.relu(),
-        };
+        let density = self.activate(&raw);
         let mut feature = self.feature.apply(&hidden);
         if self.view_dependent {
             feature = concat([&feature, &self.encode(directions, self.view_bands, progress)]);
         }
         Radiance { density, color: self.head.apply(&feature) }
+    }
+
+    /// The density alone.
+    #[track_caller]
+    pub fn density_at(&self, points: &Tensor, progress: &Tensor) -> Tensor {
+        self.activate(&self.density.apply(&self.hidden(points, progress)))
+    }
+
+    #[track_caller]
+    fn hidden(&self, points: &Tensor, progress: &Tensor) -> Tensor {
+        self.trunk.apply(&self.encode(points, self.bands, progress))
+    }
+
+    #[track_caller]
+    fn activate(&self, raw: &Tensor) -> Tensor {
+        match self.activation {
+            Density::Softplus => raw.softplus(1.0),
+            Density::Relu => raw.relu(),
+        }
     }
 
     pub fn parameters(&self) -> Vec<Parameter> {

@@ -4,6 +4,7 @@ use super::data::PlanarData;
 use super::model::{self, PlanarModel};
 use crate::Error;
 use crate::config::{Count, Layered, Settings};
+use crate::evaluation;
 use crate::geometry::Transform;
 use crate::pictures::View;
 use crate::run::metrics::{CornerError, Entry, Final, Measured, Metrics};
@@ -158,6 +159,14 @@ impl Training for Trainer {
     fn write_frame(&mut self, folder: &RunFolder) -> Result<(), Error> {
         results::write_frame(folder, self)
     }
+    fn write_evaluation(
+        &mut self,
+        folder: &RunFolder,
+        _progress: &dyn Fn(usize, usize),
+    ) -> Result<evaluation::Evaluation, Error> {
+        let found = self.evaluate()?;
+        results::write_evaluation(folder, &self.settings, &found)
+    }
     fn finish(
         &mut self,
         folder: &RunFolder,
@@ -168,6 +177,7 @@ impl Training for Trainer {
         let found = self.evaluate()?;
         let warps = found.warps.iter().map(|w| std::array::from_fn(|i| w.0[(i / 3, i % 3)])).collect();
         metrics.last = Some(Final { entry: found.entry.clone(), seconds: seconds(), warps });
+        results::write_evaluation(folder, &self.settings, &found)?;
         results::write_results(folder, layered, self, &found, metrics)
     }
     fn summary(&self, last: &Final) -> String {

@@ -3,12 +3,12 @@
 use super::model::{NotInSpace, sections};
 use super::rays::ImageSize;
 use crate::config::{ConfigError, Layered, NoiseKind};
-use crate::evaluation::PoseSetError;
+use crate::evaluation::{Alignment, Measured, PoseSetError, Scores, Similarity, ViewScores, pose_errors};
 use crate::geometry::Pose;
 use crate::run::files::WriteError;
 use crate::scene::make_scene::{MakeError, MakeOptions, make_scene};
 use crate::scene::noise::{InitialPoses, NoiseError, PoseStart};
-use crate::scene::{self, LoadOptions, Scene, SceneError, View};
+use crate::scene::{self, Layout, LoadOptions, Scene, SceneError, View};
 use std::path::Path;
 
 /// The path that stands for the procedural scene.
@@ -85,5 +85,36 @@ impl SpaceData {
         };
         let size = ImageSize { height, width };
         Ok(SpaceData { size, start, truth, scene, seed })
+    }
+
+    /// How learned poses are aligned with the true ones: as INN's paper does it on DTU, else as BARF's and L2G-NeRF's do.
+    pub fn alignment(&self) -> Alignment {
+        match self.scene.layout {
+            Layout::Dtu => Alignment::of_inn(self.scene.train.len()),
+            _ => Alignment::Procrustes,
+        }
+    }
+
+    /// The similarity from the learned world to the true one; the identity where that is unknown, or known of one camera.
+    pub fn similarity(&self, poses: &[Pose]) -> Result<Similarity, PoseSetError> {
+        match &self.truth {
+            Some(truth) if truth.len() > 1 => self.alignment().fit(poses, truth),
+            _ => Ok(Similarity::identity()),
+        }
+    }
+
+    /// Errors of learned poses of the training views, after alignment; none where there is nothing to compare with.
+    /// Translation errors are those of the world-to-camera vectors, on DTU those of the centres, as in the papers.
+    pub fn pose_scores(&self, poses: &[Pose]) -> Result<Measured, PoseSetError> {
+        let Some(truth) = self.truth.as_ref().filter(|t| t.len() > 1) else { return Ok(Measured::default()) };
+        let errors = pose_errors(&self.similarity(poses)?.align(poses), truth)?;
+        let lengths = if self.scene.layout == Layout::Dtu { &errors.center } else { &errors.translation };
+        let scores = errors.rotation_deg().into_iter().zip(lengths).map(|(degrees, length)| Scores {
+            rotation_error_deg: Some(degrees),
+            translation_error_x100: Some(100.0 * length),
+            ..Scores::default()
+        });
+        let views = self.scene.train.iter().zip(scores);
+        Ok(Measured::new(views.map(|(v, scores)| ViewScores { view: v.name.clone(), scores }).collect()))
     }
 }

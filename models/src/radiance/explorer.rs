@@ -2,10 +2,10 @@
 
 use super::data::{SpaceData, SpaceDataError};
 use super::model::{self, RadianceModel, nothing_found};
-use super::results::{self, Scores};
+use super::results;
 use crate::Error;
 use crate::config::{DepthSettings, Layered, Settings};
-use crate::evaluation::{pose_errors, procrustes};
+use crate::evaluation::{Evaluation, Lpips, Metric, Stage};
 use crate::geometry::Pose;
 use crate::run::RunFolder;
 use crate::run::metrics::{Entry, Final, Measured, Metrics};
@@ -20,22 +20,28 @@ use std::sync::Arc;
 
 /// Pixels that one run of the rendering program covers, at most.
 const VIEW_PIXELS: usize = 2048;
+/// Points that one run of the density program covers.
+const PLACES: usize = 16384;
 
 /// A model in training.
 pub struct Explorer {
     /// Without the images of the training views, which live on the device.
-    pub data: SpaceData,
-    settings: Settings,
+    pub data: Arc<SpaceData>,
+    pub(super) settings: Settings,
+    /// To measure pictures with, where there are weights.
+    pub lpips: Option<Arc<Lpips>>,
+    model: RadianceModel,
     learner: Learner,
     train: ProgramId,
     view: ProgramId,
     refine: ProgramId,
+    /// Compiled when it is first needed.
+    density: Option<ProgramId>,
     /// Pixels of one run of `view`.
     view_pixels: usize,
     rays: usize,
-    flops: f64,
-    /// Of the test views, once training has ended.
-    scores: Option<Scores>,
+    /// Once training has ended.
+    evaluation: Option<Evaluation>,
 }
 
 /// A view as the model sees it, row by row.
@@ -75,8 +81,22 @@ impl Explorer {
             learner.session.set_u32_from(model::IMAGES, i * pixels.len(), &pixels)?;
             (view.pixels, view.depth, view.mask) = (vec![], None, None);
         }
-        let (rays, flops, settings) = (model.rays_per_view() * views, model.flops(), settings.clone());
-        Ok(Explorer { data, settings, learner, train, view, refine, view_pixels, rays, flops, scores: None })
+        let (data, settings, rays) = (Arc::new(data), settings.clone(), model.rays_per_view() * views);
+        let (lpips, density, evaluation) = (None, None, None);
+        Ok(Explorer {
+            data,
+            settings,
+            lpips,
+            model,
+            learner,
+            train,
+            view,
+            refine,
+            density,
+            view_pixels,
+            rays,
+            evaluation,
+        })
     }
 
     /// The program of a training step.
@@ -134,6 +154,24 @@ impl Explorer {
         Ok(pose.after(&Pose::exp(&std::array::from_fn(|i| f64::from(twist[i])))))
     }
 
+    /// Densities at points of the learned world, in inverse lengths of it.
+    pub fn density(&mut self, points: &[[f32; 3]]) -> Result<Vec<f32>, Error> {
+        let program = match self.density {
+            Some(program) => program,
+            None => self.learner.add(&self.model.density(PLACES))?,
+        };
+        self.density = Some(program);
+        let mut found = Vec::with_capacity(points.len());
+        for chunk in points.chunks(PLACES) {
+            let mut at = chunk.concat();
+            at.resize(3 * PLACES, 0.0);
+            self.learner.set(model::DENSITY_POINTS, &at)?;
+            self.learner.run(program)?;
+            found.extend(&self.learner.read(program, "density")?[..chunk.len()]);
+        }
+        Ok(found)
+    }
+
     fn set_view(&mut self, pose: &Pose, intrinsics: &Intrinsics) -> Result<(), Error> {
         let rows = pose.to_rows().map(|x| x as f32);
         self.learner.set(model::VIEW_POSE, &rows)?;
@@ -172,23 +210,16 @@ impl Training for Explorer {
         let found = self.poses()?;
         let numbers: Vec<f64> = found.iter().flat_map(|p| p.to_rows()).collect();
         self.learner.check_finite("a pose", &numbers)?;
-        let errors = match &self.data.truth {
-            Some(truth) if truth.len() > 1 => {
-                let poses = |e| SpaceDataError::from(e);
-                let aligned = procrustes(&found, truth).map_err(poses)?.align(&found);
-                Some(pose_errors(&aligned, truth).map_err(poses)?)
-            }
-            _ => None,
-        };
+        let errors = self.data.pose_scores(&found).map_err(SpaceDataError::from)?.mean;
         let measured = Measured::Space {
             psnr_db: psnr(loss.get("render").copied().unwrap_or(1.0)),
-            rotation_error_deg: errors.as_ref().map(|e| e.mean_rotation_deg()),
-            translation_error_x100: errors.as_ref().map(|e| 100.0 * e.mean_translation()),
+            rotation_error_deg: errors.rotation_error_deg,
+            translation_error_x100: errors.translation_error_x100,
         };
         Ok(Entry { step: self.learner.steps_done(), loss, measured })
     }
     fn flops(&self) -> f64 {
-        self.flops
+        self.model.flops()
     }
     fn launches(&self) -> usize {
         self.program().launches.len()
@@ -206,6 +237,9 @@ impl Training for Explorer {
     fn write_frame(&mut self, folder: &RunFolder) -> Result<(), Error> {
         results::write_frame(folder, self)
     }
+    fn write_evaluation(&mut self, folder: &RunFolder, progress: &dyn Fn(usize, usize)) -> Result<Evaluation, Error> {
+        Ok(results::write_evaluation(folder, self, progress)?.evaluation)
+    }
     fn finish(
         &mut self,
         folder: &RunFolder,
@@ -215,7 +249,9 @@ impl Training for Explorer {
     ) -> Result<(), Error> {
         let entry = self.measure()?;
         metrics.last = Some(Final { entry, seconds: seconds(), warps: vec![] });
-        self.scores = Some(results::write_results(folder, layered, self, metrics)?);
+        let written = results::write_evaluation(folder, self, &|_, _| {})?;
+        results::write_report(folder, layered, self, metrics, written.views)?;
+        self.evaluation = Some(written.evaluation);
         Ok(())
     }
     fn summary(&self, last: &Final) -> String {
@@ -228,12 +264,12 @@ impl Training for Explorer {
                 &format!("rotation error     {r:.3} deg (mean over {} training views)\n", self.data.start.poses.len());
             text += &format!("translation error  {t:.3} x 0.01\n");
         }
-        if let Some(s) = &self.scores {
-            let refined =
-                |v: Option<f64>, places: usize| v.map_or(String::new(), |v| format!(", refined {v:.places$}"));
-            let (psnr, ssim) = (refined(s.refined_psnr_db, 2), refined(s.refined_ssim, 3));
-            text += &format!("test PSNR          {:.2} dB{psnr} ({} views)\n", s.psnr_db, s.views.len());
-            text += &format!("test SSIM          {:.3}{ssim}\n", s.ssim);
+        for metric in Metric::ALL.into_iter().filter(|m| m.is_of_views()) {
+            let of = |stage| self.evaluation.as_ref().and_then(|e| e.stage(stage)?.mean.get(metric));
+            let Some(before) = of(Stage::Before) else { continue };
+            let refined = of(Stage::After).map_or(String::new(), |v| format!(", refined {v:.0$}", metric.decimals()));
+            let name = format!("test {}", metric.heading());
+            text += &format!("{name:<18} {before:.0$}{refined}\n", metric.decimals());
         }
         text + &format!("training PSNR      {:.2} dB\nsteps              {steps} in {time}\n", last.entry.psnr_db())
     }

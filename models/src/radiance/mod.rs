@@ -1,11 +1,16 @@
 //! Registration in space: cameras find their poses while a radiance field is learned from their images.
 
 pub mod data;
+pub mod evaluate;
 pub mod explorer;
+mod export;
+mod mesh;
 pub mod model;
+mod novel_views;
 pub mod rays;
 pub mod results;
 
 pub use data::SpaceData;
 pub use explorer::{Explorer, Rendered};
 pub use model::{NotInSpace, RadianceModel};
+pub use novel_views::NovelViews;

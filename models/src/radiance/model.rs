@@ -51,6 +51,8 @@ pub const TWIST: &str = "view.twist";
 pub const TWIST_LR: &str = "view.lr";
 pub const TWIST_BIAS1: &str = "view.bias1";
 pub const TWIST_BIAS2: &str = "view.bias2";
+/// Points whose density is asked for, `[place] x 3`.
+pub const DENSITY_POINTS: &str = "density.points";
 
 /// Streams of the random numbers.
 const PIXELS: u32 = 2;
@@ -213,6 +215,13 @@ impl RadianceModel {
             outputs: vec![("render".to_string(), render)],
             updates: vec![(twist, value), (old.m, new.m), (old.v, new.v)],
         }
+    }
+
+    /// The field at `count` points of the learned world, [`DENSITY_POINTS`]: output `density`.
+    #[track_caller]
+    pub fn density(&self, count: usize) -> Step {
+        let points = Tensor::data(DENSITY_POINTS, Shape::new(&[&Axis::new("place", count)], 3));
+        Step { outputs: vec![("density".to_string(), self.field.density_at(&points, &progress()))], updates: vec![] }
     }
 
     #[track_caller]

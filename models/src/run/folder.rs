@@ -1,5 +1,6 @@
 //! The run folder: which run it holds, and that nothing of another run is overwritten.
 
+use super::checkpoint::MANIFEST;
 use super::files::{WriteError, write_atomically};
 use crate::config::{ConfigError, Count, DeviceChoice, Layered, Settings};
 use std::path::{Path, PathBuf};
@@ -27,6 +28,8 @@ pub enum FolderError {
     Occupied { path: PathBuf, difference: Option<String> },
     #[error("nothing to resume: {} holds no checkpoint", .path.display())]
     NothingToResume { path: PathBuf },
+    #[error("there is no run in {}: {lacks}", .path.display())]
+    NoRun { path: PathBuf, lacks: String },
     #[error("{} cannot be read back: {source}", .path.display())]
     Config { path: PathBuf, source: Box<ConfigError> },
 }
@@ -79,8 +82,33 @@ impl RunFolder {
         }
     }
 
+    /// Opens the folder of a run to add to it.
+    pub fn open(path: &Path) -> Result<RunFolder, FolderError> {
+        RunFolder::settings_of_run(path)?;
+        Ok(RunFolder { path: path.to_path_buf(), made: vec![], written: Default::default(), kept: true })
+    }
+
+    /// Settings of a run that has a checkpoint, named as its folder is.
+    pub fn settings_of_run(path: &Path) -> Result<Layered, FolderError> {
+        let no_run = |lacks: &str| FolderError::NoRun { path: path.to_path_buf(), lacks: lacks.to_string() };
+        if !path.exists() {
+            return Err(no_run("no such folder"));
+        }
+        let mut layered = RunFolder::held(path)?.ok_or_else(|| no_run(&format!("it holds no {CONFIG}")))?;
+        if !path.join(MANIFEST).exists() {
+            return Err(no_run("it was stopped before its first checkpoint"));
+        }
+        let name = path.canonicalize().ok().and_then(|p| Some(p.file_name()?.to_string_lossy().into_owned()));
+        layered.name = name.unwrap_or(layered.name);
+        Ok(layered)
+    }
+
     /// Settings of the run in a folder, if it holds one.
     pub fn held_settings(path: &Path) -> Result<Option<Settings>, FolderError> {
+        Ok(RunFolder::held(path)?.map(|l| l.settings))
+    }
+
+    fn held(path: &Path) -> Result<Option<Layered>, FolderError> {
         if !path.is_dir() {
             return Err(FolderError::NotAFolder { path: path.to_path_buf() });
         }
@@ -89,7 +117,7 @@ impl RunFolder {
             return Ok(None);
         }
         match Layered::load(&config.to_string_lossy()) {
-            Ok(layered) => Ok(Some(layered.settings)),
+            Ok(layered) => Ok(Some(layered)),
             Err(source) => Err(FolderError::Config { path: config, source: Box::new(source) }),
         }
     }

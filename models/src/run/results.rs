@@ -5,6 +5,7 @@ use super::folder::CONFIG;
 use super::metrics::Metrics;
 use crate::Error;
 use crate::config::{Layered, Settings};
+use crate::evaluation::{self, Measured, SUCCESS_PX, Scores, ViewScores};
 use crate::pictures::{self, Canvas};
 use crate::planar::{Evaluation, PlanarData, Trainer};
 use crate::report::{Picture, Report};
@@ -28,6 +29,26 @@ pub fn write_frame(folder: &RunFolder, trainer: &mut Trainer) -> Result<(), Erro
     let canvas = pictures::outlined(&view, &rgb, &warps, &trainer.data.truth);
     folder.write(&format!("{FRAMES}/{:07}.png", trainer.steps_done()), &canvas.to_png()?)?;
     Ok(())
+}
+
+/// Writes `evaluation.json`: corner errors of the patches, patch PSNR, and whether the patches are registered.
+pub fn write_evaluation(
+    folder: &RunFolder,
+    settings: &Settings,
+    found: &Evaluation,
+) -> Result<evaluation::Evaluation, Error> {
+    let corners: &[f64] = found.entry.corners().map_or(&[], |c| &c.per_patch);
+    let patch = |(i, error): (usize, &f64)| {
+        let scores = Scores { corner_error_px: Some(*error), ..Scores::default() };
+        ViewScores { view: format!("patch {}", i + 1), scores }
+    };
+    let mut cameras = Measured::new(corners.iter().enumerate().map(patch).collect());
+    cameras.mean.patch_psnr_db = Some(found.entry.psnr_db());
+    cameras.mean.success = cameras.mean.corner_error_px.map(|e| if e < SUCCESS_PX { 1.0 } else { 0.0 });
+    let (scene, method) = (settings.scene_name(), settings.method_name().to_string());
+    let evaluation = evaluation::Evaluation { scene, method, cameras, before: None, after: None };
+    folder.write("evaluation.json", evaluation.to_json().as_bytes())?;
+    Ok(evaluation)
 }
 
 /// Pictures, animation, metrics and report of a finished run.

@@ -30,11 +30,18 @@ impl WorldFrame {
 
     /// A world-to-camera pose of the loaded world in the file's one, its rotation made exact.
     pub fn unload(&self, pose: &Pose) -> Pose {
-        // A rotation's inverse is its transpose; `linear` is one or nearly one, hence invertible.
-        let inverse = self.linear.try_inverse().unwrap_or_else(|| self.linear.transpose());
-        let rotation = nearest_rotation(&(pose.rotation * inverse.transpose()));
-        let center = inverse * (pose.center() - self.offset) / self.scale;
-        Pose { rotation, translation: -(rotation * center) }
+        let rotation = nearest_rotation(&(pose.rotation * self.inverse().transpose()));
+        Pose { rotation, translation: -(rotation * self.unload_point(&pose.center())) }
+    }
+
+    /// A point of the loaded world in the file's one.
+    pub fn unload_point(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        self.inverse() * (point - self.offset) / self.scale
+    }
+
+    /// Of `linear`, which is a rotation or nearly one, hence invertible.
+    fn inverse(&self) -> Matrix3<f64> {
+        self.linear.try_inverse().unwrap_or_else(|| self.linear.transpose())
     }
 }
 
@@ -62,6 +69,7 @@ mod tests {
         let (x, loaded) = (Vector3::new(0.4, 1.5, -0.2), frame.load(&pose));
         let moved = frame.scale * (turn * x) + frame.offset;
         assert!((loaded.apply(&moved) - frame.scale * pose.apply(&x)).norm() < 1e-12);
+        assert!((frame.unload_point(&moved) - x).norm() < 1e-12);
         let back = frame.unload(&loaded);
         assert!((back.rotation - pose.rotation).norm() < 1e-12 && (back.translation - pose.translation).norm() < 1e-12);
     }

@@ -149,6 +149,11 @@ impl fmt::Display for Layout {
     }
 }
 
+/// Whether cameras stand around something, rather than look all the same way.
+pub fn stand_around(poses: &[Pose]) -> bool {
+    matches!(normalise::Arrangement::of(poses), normalise::Arrangement::Around { .. })
+}
+
 /// What to load, and how. The default is everything, at the images' own size, in whatever layout it is found.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct LoadOptions {

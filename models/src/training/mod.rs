@@ -9,6 +9,7 @@ pub use optimise::Rates;
 
 use crate::Error;
 use crate::config::Layered;
+use crate::evaluation::Evaluation;
 use crate::run::checkpoint::Checkpoint;
 use crate::run::metrics::{Entry, Final, Metrics};
 use crate::run::{RunFolder, checkpoint::Saved};
@@ -42,6 +43,10 @@ pub trait Training {
 
     /// Writes one frame of the animation.
     fn write_frame(&mut self, folder: &RunFolder) -> Result<(), Error>;
+
+    /// Measures the model as it is and writes what it finds, `evaluation.json` first of all. `progress` hears how many of how
+    /// many views are done.
+    fn write_evaluation(&mut self, folder: &RunFolder, progress: &dyn Fn(usize, usize)) -> Result<Evaluation, Error>;
 
     /// Measures everything at the end of the last step into `metrics`, with the `seconds` that training took, and writes the
     /// results.

@@ -20,6 +20,7 @@ fn a_run_leaves_metrics_pictures_checkpoint_and_report() {
         "checkpoint-0000012.safetensors",
         "checkpoint.json",
         "config.toml",
+        "evaluation.json",
         "frames",
         "learned.png",
         "metrics.json",

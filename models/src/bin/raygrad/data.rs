@@ -1,6 +1,6 @@
 //! `raygrad data`: what a scene's folder holds.
 
-use crate::progress::images;
+use crate::progress;
 use clap::Args;
 use raygrad::Error;
 use raygrad::run::files::write_atomically;
@@ -33,7 +33,7 @@ fn plot_file(name: &str) -> Result<PathBuf, String> {
 
 pub fn run(args: &DataArgs) -> anyhow::Result<ExitCode> {
     let options = LoadOptions { layout: args.layout, ..LoadOptions::default() };
-    let bar = images("reading");
+    let bar = progress::bar("reading", "images");
     let loaded = load(&args.folder, &options, &|done, all| bar.show(done, all));
     bar.finish();
     // Sizes may differ where they are brought to one later; the summary shows the first.

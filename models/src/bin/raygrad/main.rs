@@ -5,17 +5,27 @@
 
 mod bench;
 mod data;
+mod eval;
 mod explain;
+mod export;
+mod held;
 mod make_scene;
 mod progress;
+mod surface;
+mod sweep;
 mod train;
+mod video;
 
+use anyhow::Context;
 use clap::{Args, Parser, Subcommand};
 use raygrad::config::PRESETS;
 use raygrad::run::files::WriteError;
 use raygrad::{Error, Experiment};
+use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Differentiable rendering: train, explain and time neural fields and warps.
 #[derive(Parser)]
@@ -29,6 +39,14 @@ struct Cli {
 enum Command {
     /// Train an experiment and write its results into a run folder.
     Train(train::TrainArgs),
+    /// Measure a run at its last checkpoint: errors, pictures, the papers' numbers beside them, and its surface.
+    Eval(eval::EvalArgs),
+    /// Train every preset on every scene with every seed of a file, and print the papers' tables of the results.
+    Sweep(sweep::SweepArgs),
+    /// Write the cameras that a run found for other programs.
+    Export(export::ExportArgs),
+    /// Render the papers' novel views of a run as a video.
+    Video(video::VideoArgs),
     /// List what programs can run on.
     Devices,
     /// List the built-in experiments.
@@ -95,6 +113,10 @@ fn main() -> ExitCode {
     quiet_drivers();
     let done = match Cli::parse().command {
         Command::Train(args) => train::run(&args),
+        Command::Eval(args) => eval::run(&args),
+        Command::Sweep(args) => sweep::run(&args),
+        Command::Export(args) => export::run(&args),
+        Command::Video(args) => video::run(&args),
         Command::Devices => devices(),
         Command::Presets => presets(),
         Command::Explain(args) => explain::run(&args),
@@ -138,6 +160,27 @@ fn presets() -> anyhow::Result<ExitCode> {
         println!("{:width$}  {}", preset.name, preset.summary());
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// Set by the first Ctrl-C, which asks for a checkpoint; the second does not wait for it.
+fn listen() -> anyhow::Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let handler = stop.clone();
+    ctrlc::set_handler(move || {
+        if handler.swap(true, Ordering::Relaxed) {
+            std::process::exit(130);
+        }
+    })
+    .context("cannot listen for Ctrl-C")?;
+    Ok(stop)
+}
+
+/// Prints to standard output. A reader that has had enough, as `head`, is no error.
+fn print(text: &str) -> anyhow::Result<()> {
+    match std::io::stdout().lock().write_all(text.as_bytes()) {
+        Err(e) if e.kind() != std::io::ErrorKind::BrokenPipe => Err(e).context("cannot write to standard output"),
+        _ => Ok(()),
+    }
 }
 
 /// A folder given for output, made if it is not there.

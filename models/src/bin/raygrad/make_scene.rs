@@ -1,6 +1,6 @@
 //! `raygrad make-scene`: the built-in scene as files.
 
-use crate::progress::images;
+use crate::progress;
 use clap::Args;
 use raygrad::scene::make_scene::{MakeOptions, make_scene};
 use std::path::PathBuf;
@@ -23,7 +23,7 @@ pub struct MakeSceneArgs {
 
 pub fn run(args: &MakeSceneArgs) -> anyhow::Result<ExitCode> {
     let options = MakeOptions { views: args.views, size: args.size, seed: args.seed };
-    let bar = images("making");
+    let bar = progress::bar("making", "images");
     let made = make_scene(&args.folder, &options, &|done, all| bar.show(done, all));
     bar.finish();
     made.map_err(raygrad::Error::from)?;

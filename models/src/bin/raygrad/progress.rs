@@ -96,19 +96,20 @@ impl Drop for Progress {
     }
 }
 
-/// A bar of images on a terminal; nothing elsewhere.
-pub struct Images(ProgressBar);
+/// A bar on a terminal; nothing elsewhere.
+pub struct Bar(ProgressBar);
 
-pub fn images(what: &'static str) -> Images {
+/// A bar of things done: `bar("reading", "images")`.
+pub fn bar(what: &'static str, unit: &str) -> Bar {
     let bar = if std::io::stderr().is_terminal() { ProgressBar::no_length() } else { ProgressBar::hidden() };
-    let style = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} images");
+    let style = ProgressStyle::with_template(&format!("{{msg}} {{wide_bar}} {{pos}}/{{len}} {unit}"));
     bar.set_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()));
     bar.set_message(what);
-    Images(bar)
+    Bar(bar)
 }
 
-impl Images {
-    /// `done` of `all` images; calls may come from any thread and in any order.
+impl Bar {
+    /// `done` of `all`; calls may come from any thread and in any order.
     pub fn show(&self, done: usize, all: usize) {
         self.0.set_length(all as u64);
         self.0.set_position(self.0.position().max(done as u64));

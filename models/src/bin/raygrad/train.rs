@@ -1,14 +1,11 @@
 //! `raygrad train`.
 
-use crate::Choice;
 use crate::progress::Progress;
-use anyhow::Context;
+use crate::{Choice, listen};
 use clap::Args;
 use raygrad::Outcome;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 #[derive(Args)]
 pub struct TrainArgs {
@@ -20,6 +17,9 @@ pub struct TrainArgs {
     /// Perturbation file to register, instead of a drawn one.
     #[arg(long, value_name = "FILE")]
     perturbation: Option<String>,
+    /// Weights of LPIPS, as scripts/convert_lpips.py writes them, to measure test views with.
+    #[arg(long, value_name = "WEIGHTS")]
+    lpips: Option<PathBuf>,
     /// Run folder; by default the first free one of runs/PRESET, runs/PRESET-2, ...
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
@@ -37,18 +37,13 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
             experiment.set_option(option, key, value).map_err(raygrad::Error::from)?;
         }
     }
+    if let Some(weights) = &args.lpips {
+        experiment = experiment.lpips(weights)?;
+    }
     if let Some(out) = &args.out {
         experiment = experiment.out(out);
     }
-    let stop = Arc::new(AtomicBool::new(false));
-    let handler = stop.clone();
-    ctrlc::set_handler(move || {
-        // The first asks for a checkpoint, the second does not wait for it.
-        if handler.swap(true, Ordering::Relaxed) {
-            std::process::exit(130);
-        }
-    })
-    .context("cannot listen for Ctrl-C")?;
+    let stop = listen()?;
     let outcome = experiment.train_observed(&mut Progress::new(), &stop)?;
     Ok(tell(&outcome))
 }

@@ -1,0 +1,108 @@
+//! `raygrad eval`: measures a run again, at its last checkpoint.
+
+use crate::held::HeldRun;
+use crate::print;
+use crate::progress::bar;
+use crate::surface::{Surface, SurfaceArgs};
+use clap::Args;
+use raygrad::Error;
+use raygrad::evaluation::{Evaluation, PublishedTable, Table, published_for};
+use raygrad::run::RunFolder;
+use raygrad::run::files::write_atomically;
+use raygrad::scene::Layout;
+use raygrad::training::Training;
+use serde::Serialize;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+#[derive(Args)]
+pub struct EvalArgs {
+    #[command(flatten)]
+    held: HeldRun,
+    /// Weights of LPIPS, as scripts/convert_lpips.py writes them.
+    #[arg(long, value_name = "WEIGHTS")]
+    lpips: Option<PathBuf>,
+    /// Write every view, and the mean, as comma-separated values.
+    #[arg(long, value_name = "FILE")]
+    csv: Option<PathBuf>,
+    /// Write the table as LaTeX.
+    #[arg(long, value_name = "FILE")]
+    latex: Option<PathBuf>,
+    /// Print one JSON object instead of the table.
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    surface: SurfaceArgs,
+}
+
+#[derive(Serialize)]
+struct Json<'a> {
+    /// Steps done, of how many.
+    step: usize,
+    steps: usize,
+    #[serde(flatten)]
+    evaluation: &'a Evaluation,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    mesh: Option<&'a Surface>,
+    /// Of the papers, for the same scene, method and start.
+    published: &'a [PublishedTable],
+}
+
+pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
+    let mut experiment = args.held.experiment()?;
+    if let Some(weights) = &args.lpips {
+        experiment = experiment.lpips(weights)?;
+    }
+    let reference = args.surface.reference()?;
+    let folder = RunFolder::open(&args.held.run).map_err(Error::from)?;
+    let settings = experiment.layered.settings.clone();
+    let (evaluation, step, surface, layout);
+    if settings.scene.is_some() || args.surface.wanted() {
+        let mut explorer = experiment.restored_explorer()?;
+        evaluation = measure(&mut explorer, &folder)?;
+        layout = Some(explorer.data.scene.layout);
+        step = explorer.steps_done();
+        surface = match args.surface.wanted() {
+            true => Some(args.surface.run(&mut explorer, reference.as_ref())?),
+            false => None,
+        };
+    } else {
+        let mut trainer = experiment.restored()?;
+        evaluation = measure(&mut *trainer, &folder)?;
+        (step, surface, layout) = (trainer.steps_done(), None, None);
+    }
+    let dataset = layout.map_or("planar", Layout::name);
+    let (start, scene) = (settings.start_name(), evaluation.scene.as_str());
+    let published = published_for(dataset, start.as_deref(), &[scene], &[settings.method_name()]);
+    let title = format!("{}, step {step} of {}", args.held.run.display(), settings.optim.steps);
+    let table = Table { title, evaluations: vec![evaluation], published };
+    for (path, text) in [(&args.csv, table.views_csv()), (&args.latex, table.to_latex())] {
+        if let Some(path) = path {
+            write_atomically(path, text.as_bytes()).map_err(Error::from)?;
+        }
+    }
+    let evaluation = &table.evaluations[0];
+    if args.json {
+        let (steps, published) = (settings.optim.steps, &table.published);
+        let json = serde_json::to_string(&Json { step, steps, evaluation, mesh: surface.as_ref(), published })?;
+        print(&format!("{json}\n"))?;
+        return Ok(ExitCode::SUCCESS);
+    }
+    let mut text = table.to_text();
+    if settings.scene.is_none() {
+        let errors = evaluation.cameras.views.iter().filter_map(|v| v.scores.corner_error_px);
+        text += &format!("patches (px)  {}\n", errors.map(|e| format!("{e:.3}")).collect::<Vec<_>>().join("  "));
+    }
+    if let Some(surface) = &surface {
+        text += &args.surface.text(surface);
+    }
+    print(&text)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn measure(model: &mut dyn Training, folder: &RunFolder) -> Result<Evaluation, Error> {
+    let shown = bar("evaluating", "views");
+    let evaluation = model.write_evaluation(folder, &|done, all| shown.show(done, all));
+    shown.finish();
+    evaluation
+}

@@ -1,0 +1,103 @@
+//! `raygrad sweep`: runs of one file, and the papers' tables of them.
+
+use crate::progress::Progress as Shown;
+use crate::{listen, print};
+use anyhow::bail;
+use clap::Args;
+use raygrad::config::{Sweep, SweepCell};
+use raygrad::evaluation::{Evaluation, Lpips};
+use raygrad::run::FolderError;
+use raygrad::run::files::write_atomically;
+use raygrad::sweep::{Progress, results};
+use raygrad::{Error, Experiment};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::atomic::AtomicBool;
+
+#[derive(Args)]
+pub struct SweepArgs {
+    /// What to run: a TOML file with the lists `presets`, `scenes` and `seeds`, and the tables `set` and `preset`.
+    file: PathBuf,
+    /// Folder for the runs and the tables; by default runs/FILE without its ending.
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Insist on going on with a sweep: refuse a folder that holds none of its runs.
+    #[arg(long)]
+    resume: bool,
+    /// Weights of LPIPS, as scripts/convert_lpips.py writes them, to measure test views with.
+    #[arg(long, value_name = "WEIGHTS")]
+    lpips: Option<PathBuf>,
+}
+
+pub fn run(args: &SweepArgs) -> anyhow::Result<ExitCode> {
+    let sweep = Sweep::load(&args.file).map_err(Error::from)?;
+    let folder = args.out.clone().unwrap_or_else(|| Path::new("runs").join(&sweep.name));
+    // A damaged file of weights, or a folder with something else in it, is found before anything runs.
+    if let Some(weights) = &args.lpips {
+        Lpips::load(weights).map_err(Error::from)?;
+    }
+    let mut states = vec![];
+    for cell in &sweep.cells {
+        states.push(cell.progress(&folder)?);
+    }
+    if args.resume && states.iter().all(|s| *s == Progress::Open) {
+        return Err(Error::from(FolderError::NothingToResume { path: folder }).into());
+    }
+    let stop = listen()?;
+    let (mut done, mut failed) = (vec![], vec![]);
+    for (i, (cell, state)) in sweep.cells.iter().zip(states).enumerate() {
+        eprintln!("run {} of {}: {}", i + 1, sweep.cells.len(), cell.name);
+        match train(cell, state, &folder, args.lpips.as_deref(), &stop) {
+            Ok(Some(evaluation)) => done.push((cell, evaluation)),
+            Ok(None) => {
+                print(&format!("stopped; continue with the same command and `--out {} --resume`\n", folder.display()))?;
+                return Ok(ExitCode::from(130));
+            }
+            // One run that fails, as by diverging, leaves the others to be done.
+            Err(error) if !error.is_bad_input() => {
+                eprintln!("{} failed: {error}", cell.name);
+                failed.push(cell.name.as_str());
+            }
+            Err(error) => return Err(error.into()),
+        }
+    }
+    crate::output_folder(&folder)?;
+    let (table, json) = results(&sweep, &done);
+    for (ending, text) in [("csv", table.to_csv()), ("tex", table.to_latex()), ("json", json)] {
+        write_atomically(&folder.join(format!("sweep.{ending}")), text.as_bytes()).map_err(Error::from)?;
+    }
+    print(&format!("{}results in {}/sweep.csv, .tex and .json\n", table.to_text(), folder.display()))?;
+    if !failed.is_empty() {
+        bail!("{} of {} runs failed: {}", failed.len(), sweep.cells.len(), failed.join(", "));
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// What a run has come to; nothing if it was stopped.
+fn train(
+    cell: &SweepCell,
+    state: Progress,
+    folder: &Path,
+    lpips: Option<&Path>,
+    stop: &AtomicBool,
+) -> Result<Option<Evaluation>, Error> {
+    let begun = match state {
+        Progress::Done(evaluation) => return Ok(Some(evaluation)),
+        Progress::Begun => true,
+        Progress::Open => {
+            cell.clear(folder)?;
+            false
+        }
+    };
+    let mut experiment = Experiment::of(cell.layered.clone()).out(cell.folder(folder)).resume(begun);
+    if let Some(weights) = lpips {
+        experiment = experiment.lpips(weights)?;
+    }
+    if experiment.train_observed(&mut Shown::new(), stop)?.interrupted {
+        return Ok(None);
+    }
+    match cell.progress(folder)? {
+        Progress::Done(evaluation) => Ok(Some(evaluation)),
+        _ => Ok(None),
+    }
+}

@@ -1,0 +1,79 @@
+//! What papers call a run: its method, its scene, and where its poses started.
+
+use super::settings::{Encoding, Method, NoiseKind, Settings};
+use std::path::Path;
+
+impl Settings {
+    /// `barf`, `naive`, `l2g`, `l2g-noglobal`, `inn`, `multi-inn`, `mlp`, `implicit-mlp`, `se3-field` or `reference`.
+    pub fn method_name(&self) -> &'static str {
+        match self.warp.method {
+            Method::None => "reference",
+            Method::Global if self.field.encoding == Encoding::Windowed => "barf",
+            Method::Global => "naive",
+            Method::Local if self.loss.alignment > 0.0 => "l2g",
+            Method::Local => "l2g-noglobal",
+            Method::Invertible => "inn",
+            Method::MultiInvertible => "multi-inn",
+            Method::Mlp => "mlp",
+            Method::ImplicitMlp => "implicit-mlp",
+            Method::Se3Field => "se3-field",
+        }
+    }
+
+    /// The scene's folder without those above it (`lego`; `scan24` of `dtu_scan24`), or the photo without its ending.
+    pub fn scene_name(&self) -> String {
+        let (path, part): (&str, fn(&Path) -> Option<&std::ffi::OsStr>) = match &self.scene {
+            Some(scene) => (&scene.path, Path::file_name),
+            None => (&self.data.image, Path::file_stem),
+        };
+        let name = part(Path::new(path)).map_or(path.into(), |n| n.to_string_lossy());
+        match name.rsplit_once('_') {
+            Some((_, scan)) if scan.starts_with("scan") => scan.to_string(),
+            _ => name.into_owned(),
+        }
+    }
+
+    /// Where poses or patches started, as `published.toml` has it; nothing where the true ones are known.
+    pub fn start_name(&self) -> Option<String> {
+        let noise = &self.noise;
+        let of_scene = self.scene.as_ref().map(|s| (s.poses.as_str(), noise.kind));
+        match of_scene {
+            _ if self.warp.method == Method::None => None,
+            None => Some(format!("homography {}, translation {}", noise.homography, noise.translation)),
+            Some(("truth", _)) => None,
+            Some(("identity", _)) => Some("identity".to_string()),
+            Some(("noisy", NoiseKind::Barf)) => Some(format!("noise {}", noise.rotation)),
+            Some(("noisy", NoiseKind::L2g)) => Some("noise per scene".to_string()),
+            Some(_) => Some("colmap".to_string()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::config::Layered;
+
+    #[test]
+    fn names_of_presets_are_those_of_the_papers() {
+        for (preset, method, start) in [
+            ("barf-blender-original", "barf", Some("noise 0.15")),
+            ("naive-blender", "naive", Some("noise per scene")),
+            ("l2g-noglobal-blender", "l2g-noglobal", Some("noise per scene")),
+            ("inn-llff", "inn", Some("identity")),
+            ("nerf-blender", "reference", None),
+            ("planar-barf-original", "barf", Some("homography 0.1, translation 0.2")),
+            ("planar-multi-inn", "multi-inn", Some("homography 0.3, translation 0.1")),
+        ] {
+            let settings = Layered::load(preset).unwrap().settings;
+            assert_eq!((settings.method_name(), settings.start_name().as_deref()), (method, start), "{preset}");
+        }
+        let scene = |preset: &str, set: &str| {
+            let mut layered = Layered::load(preset).unwrap();
+            layered.set(set).unwrap();
+            layered.settings.scene_name()
+        };
+        assert_eq!(scene("barf-blender", "scene.path=data/lego/"), "lego");
+        assert_eq!(scene("inn-dtu", "scene.path=data/dtu_scan24"), "scan24");
+        assert_eq!(scene("planar-barf", "data.image=photos/cat.jpg"), "cat");
+    }
+}

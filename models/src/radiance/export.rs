@@ -1,0 +1,39 @@
+//! The cameras that a run found, as other programs take them.
+
+use super::data::SpaceDataError;
+use super::explorer::Explorer;
+use crate::Error;
+use crate::evaluation::ExportCamera;
+use crate::scene::DepthRange;
+
+/// The near plane of scenes with inverse depth lies at this part of the nearest depth seen.
+const NEAR_PART: f64 = 0.75;
+/// What is written for the farthest depth of those, in nearest ones: their depths have no end.
+const FAR: f64 = 100.0;
+
+impl Explorer {
+    /// The training cameras at the poses found, aligned with the true ones, in the world and unit of the scene's files; for
+    /// images of the size that was trained with.
+    pub fn cameras(&mut self) -> Result<Vec<ExportCamera>, Error> {
+        let found = self.poses()?;
+        let aligned = self.data.similarity(&found).map_err(SpaceDataError::from)?.align(&found);
+        let scene = &self.data.scene;
+        let bounds = match scene.depth {
+            DepthRange::Metric { near, far } => [near, far],
+            DepthRange::Inverse { near } => [near / NEAR_PART, FAR * near / NEAR_PART],
+        };
+        let camera = |(view, pose): (&crate::scene::View, _)| {
+            let lens = &view.intrinsics;
+            ExportCamera {
+                name: view.name.clone(),
+                width: lens.width,
+                height: lens.height,
+                focal: [lens.fx, lens.fy],
+                principal: [lens.cx, lens.cy],
+                pose: scene.frame.unload(pose),
+                bounds: Some(bounds.map(|d| d / scene.frame.scale)),
+            }
+        };
+        Ok(scene.train.iter().zip(&aligned).map(camera).collect())
+    }
+}
