@@ -56,6 +56,11 @@ pub use raygrad_runtime::Device;
 #[doc = include_str!("../../README.md")]
 struct Readme;
 
+/// The program of `docs/new_warp.md` runs.
+#[cfg(doctest)]
+#[doc = include_str!("../../docs/new_warp.md")]
+struct NewWarp;
+
 /// What defining and training a warp takes.
 pub mod prelude {
     pub use crate::warps::{Points, Warp};

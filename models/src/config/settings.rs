@@ -69,7 +69,7 @@ pub struct SceneSettings {
     pub train_views: Count,
     pub val_views: Count,
     pub test_views: Count,
-    /// `truth`, `identity`, `noisy`, or a file of poses.
+    /// `truth`, `identity`, `noisy`, `auto`, or a file of poses.
     pub poses: String,
 }
 
@@ -106,6 +106,8 @@ pub enum DepthSettings {
     Inverse,
     /// Metric, near and far following the cameras' spread.
     Auto,
+    /// What the scene's layout says.
+    Scene,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -180,6 +182,7 @@ pub struct Optim {
     pub lr_end: f64,
     pub lr_warp: f64,
     pub lr_warp_end: f64,
+    pub warmup_pose: usize,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

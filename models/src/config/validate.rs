@@ -74,7 +74,7 @@ impl Layered {
         let ordered = match train.depth {
             DepthSettings::Metric => 0.0 <= near && near < far && far.is_finite(),
             DepthSettings::Inverse => near > far && far >= 0.0 && near.is_finite(),
-            DepthSettings::Auto => true,
+            DepthSettings::Auto | DepthSettings::Scene => true,
         };
         if !ordered {
             let rule = match train.depth {

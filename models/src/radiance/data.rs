@@ -2,13 +2,13 @@
 
 use super::model::{NotInSpace, sections};
 use super::rays::ImageSize;
-use crate::config::{ConfigError, Layered, NoiseKind};
+use crate::config::{ConfigError, DepthSettings, Layered, NoiseKind, Settings};
 use crate::evaluation::{Alignment, Measured, PoseSetError, Scores, Similarity, ViewScores, pose_errors};
 use crate::geometry::Pose;
 use crate::run::files::WriteError;
 use crate::scene::make_scene::{MakeError, MakeOptions, make_scene};
 use crate::scene::noise::{InitialPoses, NoiseError, PoseStart};
-use crate::scene::{self, Layout, LoadOptions, Scene, SceneError, View};
+use crate::scene::{self, DepthRange, Layout, LoadOptions, Scene, SceneError, View};
 use std::path::Path;
 
 /// The path that stands for the procedural scene.
@@ -74,7 +74,13 @@ impl SpaceData {
         let truth: Option<Vec<Pose>> = scene.train.iter().map(|v: &View| v.pose).collect();
         let names = || scene.train.iter().map(|v| (v.name.as_str(), v.pose));
         let (noise, seed) = (&settings.noise, settings.run.seed);
-        let start = match (wanted.poses.as_str(), noise.kind) {
+        let captured = !matches!(scene.layout, Layout::Blender | Layout::Dtu);
+        let poses = match wanted.poses.as_str() {
+            "auto" if captured => "identity",
+            "auto" => "noisy",
+            other => other,
+        };
+        let start = match (poses, noise.kind) {
             ("truth", _) => InitialPoses::Truth.draw(names(), seed)?,
             ("identity", _) => InitialPoses::Identity.draw(names(), seed)?,
             ("noisy", NoiseKind::Barf) => InitialPoses::Barf { deviation: noise.rotation }.draw(names(), seed)?,
@@ -85,6 +91,18 @@ impl SpaceData {
         };
         let size = ImageSize { height, width };
         Ok(SpaceData { size, start, truth, scene, seed })
+    }
+
+    /// The settings with the scene's own depths, where they ask for them.
+    pub fn with_depths(&self, settings: &Settings) -> Settings {
+        let mut settings = settings.clone();
+        if let Some(train) = settings.train.as_mut().filter(|t| t.depth == DepthSettings::Scene) {
+            (train.depth, train.range) = match self.scene.depth {
+                DepthRange::Metric { near, far } => (DepthSettings::Metric, [near, far]),
+                DepthRange::Inverse { near } => (DepthSettings::Inverse, [1.0 / near, 0.0]),
+            };
+        }
+        settings
     }
 
     /// How learned poses are aligned with the true ones: as INN's paper does it on DTU, else as BARF's and L2G-NeRF's do.

@@ -61,6 +61,7 @@ impl Explorer {
         warp: Arc<dyn Warp>,
         device: Device,
     ) -> Result<Explorer, Error> {
+        let settings = &data.with_depths(settings);
         let views = data.scene.train.len();
         let model = RadianceModel::new(settings, data.size, views, warp).map_err(SpaceDataError::from)?;
         let view_pixels = VIEW_PIXELS.min(data.size.pixels());

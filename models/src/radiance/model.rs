@@ -264,7 +264,7 @@ impl RadianceModel {
         };
         let spread = match self.train.depth {
             DepthSettings::Inverse => Spread::Inverse,
-            DepthSettings::Metric | DepthSettings::Auto => Spread::Metric,
+            DepthSettings::Metric | DepthSettings::Auto | DepthSettings::Scene => Spread::Metric,
         };
         let depth = depth_samples(&sample, &jitter, near, far, spread);
         let length = rays.length();

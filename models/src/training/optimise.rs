@@ -1,7 +1,9 @@
 //! Adam on field and warp, and the values of one step that the host sets: learning rates, Adam's bias corrections, progress,
 //! step number.
 //!
-//! lr(it) = lr (lr_end / lr)^(it / T); progress is it / T, the state the step before left.
+//! lr(it) = lr (lr_end / lr)^(it / T); progress is it / T, the state the step before left. The warp's rate is multiplied by
+//! min(1, it / `warmup_pose`): a field that knows nothing yet would only push the poses apart. (The published L2G code warms
+//! up the codes alone; here it is the whole warp.)
 
 use crate::config::Optim;
 use raygrad_compiler::autodiff::grad;
@@ -30,11 +32,12 @@ impl Rates {
     pub fn at(optim: &Optim, it: usize) -> Rates {
         let progress = it as f64 / optim.steps as f64;
         let decayed = |start: f64, end: f64| start * (end / start).powf(progress);
+        let warm = if it < optim.warmup_pose { it as f64 / optim.warmup_pose as f64 } else { 1.0 };
         let (bias1, bias2) = Adam::default().bias_corrections(it as u64 + 1);
         Rates {
             progress,
             lr_field: decayed(optim.lr, optim.lr_end),
-            lr_warp: decayed(optim.lr_warp, optim.lr_warp_end),
+            lr_warp: decayed(optim.lr_warp, optim.lr_warp_end) * warm,
             bias1,
             bias2,
         }
