@@ -49,6 +49,12 @@ pub struct Outcome {
 
 /// Told how a run gets on. Every method does nothing unless it is given.
 pub trait Observer {
+    /// Hears, from any thread, how many images of how many are loaded.
+    fn loading(&self) -> Box<dyn Fn(usize, usize) + Sync> {
+        Box::new(|_, _| {})
+    }
+    /// How long the steps that are left should take on this device, by its name, in seconds.
+    fn expected(&mut self, _seconds: f64, _device: &str) {}
     /// The run begins, or goes on, after `done` of `steps` steps.
     fn begin(&mut self, _folder: &Path, _done: usize, _steps: usize) {}
     /// A step was submitted.
@@ -137,8 +143,13 @@ impl Experiment {
 
     /// Checks everything, compiles, and fills the device: an experiment before its first step.
     pub fn training(&self) -> Result<Box<dyn Training>, Error> {
+        self.training_after(&|_, _| {})
+    }
+
+    /// The same, telling how many images of how many are loaded.
+    fn training_after(&self, loading: &(dyn Fn(usize, usize) + Sync)) -> Result<Box<dyn Training>, Error> {
         if self.layered.settings.scene.is_some() {
-            return Ok(Box::new(self.explorer()?));
+            return Ok(Box::new(self.explorer_after(loading)?));
         }
         Ok(Box::new(self.trainer()?))
     }
@@ -154,9 +165,13 @@ impl Experiment {
 
     /// The same for an experiment in space.
     pub fn explorer(&self) -> Result<Explorer, Error> {
+        self.explorer_after(&|_, _| {})
+    }
+
+    fn explorer_after(&self, loading: &(dyn Fn(usize, usize) + Sync)) -> Result<Explorer, Error> {
         self.layered.validate()?;
         let settings = &self.layered.settings;
-        let data = SpaceData::load(&self.layered, &|_, _| {})?;
+        let data = SpaceData::load(&self.layered, loading)?;
         let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings, data.scene.train.len()));
         let mut explorer = Explorer::new(settings, data, warp, self.open()?)?;
         explorer.lpips = self.lpips.clone();
@@ -209,7 +224,7 @@ impl Experiment {
             true => RunFolder::reopen(&path, settings)?,
             false => RunFolder::claim(&path, settings)?,
         };
-        let mut trainer = self.training()?;
+        let mut trainer = self.training_after(&*observer.loading())?;
         let mut run = Run { metrics: Metrics::default(), seconds: 0.0, begun: Instant::now() };
         if self.resume {
             let checkpoint = self.restore(&mut *trainer)?;
@@ -219,6 +234,11 @@ impl Experiment {
             trainer.write_data(&folder)?;
         }
         folder.keep();
+        let left = settings.optim.steps.saturating_sub(trainer.steps_done());
+        if left >= TRIED {
+            let seconds = seconds_per_step(&mut *trainer)?;
+            observer.expected(seconds * left as f64, &trainer.learner().device_name());
+        }
         run.begun = Instant::now();
         observer.begin(&path, trainer.steps_done(), settings.optim.steps);
         let interrupted = self.run_steps(&mut run, &mut *trainer, &folder, observer, stop)?;
@@ -269,6 +289,33 @@ impl Experiment {
         }
         Ok(false)
     }
+}
+
+/// Runs of fewer steps are not timed before they begin.
+const TRIED: usize = 50;
+/// Steps that are timed, or fewer if they take longer than so many seconds.
+const TIMED: usize = 5;
+const TRIAL: f64 = 1.0;
+
+/// Seconds that a step takes, by taking a few and going back to where they began.
+fn seconds_per_step(trainer: &mut dyn Training) -> Result<f64, Error> {
+    let (step, tensors) = (trainer.steps_done(), trainer.tensors()?);
+    let begun = Checkpoint { step, seconds: 0.0, steps: vec![], tensors };
+    let mut one = || -> Result<f64, Error> {
+        let start = Instant::now();
+        trainer.step()?;
+        trainer.wait()?;
+        Ok(start.elapsed().as_secs_f64())
+    };
+    // The first one warms up.
+    one()?;
+    let mut times = vec![];
+    while times.len() < TIMED && times.iter().sum::<f64>() < TRIAL {
+        times.push(one()?);
+    }
+    trainer.restore(&begun)?;
+    times.sort_by(f64::total_cmp);
+    Ok(times[times.len() / 2])
 }
 
 /// What accumulates over a run.

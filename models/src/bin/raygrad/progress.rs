@@ -38,6 +38,24 @@ impl Progress {
 }
 
 impl Observer for Progress {
+    fn loading(&self) -> Box<dyn Fn(usize, usize) + Sync> {
+        let bar = bar("loading", "images");
+        Box::new(move |done, all| {
+            bar.show(done, all);
+            if done == all {
+                bar.finish();
+            }
+        })
+    }
+
+    fn expected(&mut self, seconds: f64, device: &str) {
+        let text = format!("about {} on {device}", duration(seconds));
+        match &self.bar {
+            Some(bar) => bar.println(text),
+            None => eprintln!("{text}"),
+        }
+    }
+
     fn begin(&mut self, folder: &Path, done: usize, steps: usize) {
         (self.begun, self.first, self.done, self.steps) = (Instant::now(), done, done, steps);
         match &self.bar {
