@@ -105,9 +105,9 @@ fn functions(isa: Isa, len: usize, seconds: f64) {
     print!("{isa} ns/value, runs of {len}:");
     use Prim::*;
     for prim in [Exp, Log, Sin, Cos, Tanh, Atan2, Add, Div, Sqrt, ToU32] {
-        let operands = [Operand::Lanes(a.as_ptr()), Operand::Lanes(b.as_ptr()), Operand::Splat(0)];
+        let operands = [Operand::Lanes(a.as_ptr()), Operand::Lanes(b.as_ptr()), Operand::Splat(0)].into();
         // SAFETY: all runs have `len` lanes.
-        let each = nanoseconds(len, 0.1 * seconds, |_| unsafe { apply(isa, prim, out.as_mut_ptr(), operands, len) });
+        let each = nanoseconds(len, 0.1 * seconds, |_| unsafe { apply(isa, prim, out.as_mut_ptr(), &operands, len) });
         print!(" {prim:?} {each:.3}");
     }
     println!();

@@ -35,7 +35,7 @@ pub use outer::{Outer, outer, outer_len, unblock};
 pub use panels::{pack_panels, panel_len};
 pub use peak::peak_gflops;
 pub use reduce::{rows_max, rows_sum};
-pub use vector::{Operand, apply};
+pub use vector::{Operand, Operands, apply};
 
 /// Row counts of matrix kernels are multiples of this.
 pub const ROW_BLOCK: usize = 32;

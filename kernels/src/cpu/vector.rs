@@ -23,21 +23,60 @@ impl Operand {
     }
 }
 
-/// Computes `out[i] = prim(operands[0][i], ...)` for `len` lanes; operands beyond the primitive's arity are ignored.
+/// The operands of a call. Kinds and words lie apart: an enum is written in halves and read whole, which a processor waits
+/// for, and most runs of lanes are so short that the wait would be a third of their time.
+#[derive(Clone, Copy, Debug)]
+pub struct Operands {
+    splat: [bool; 3],
+    /// An address, or the bits of all lanes.
+    words: [usize; 3],
+}
+
+impl Operands {
+    /// No operands.
+    pub const NONE: Operands = Operands { splat: [true; 3], words: [0; 3] };
+
+    /// Makes `operand` the one at position `i`.
+    #[inline(always)]
+    pub fn set(&mut self, i: usize, operand: Operand) {
+        (self.splat[i], self.words[i]) = match operand {
+            Operand::Lanes(at) => (false, at.expose_provenance()),
+            Operand::Splat(bits) => (true, bits as usize),
+        };
+    }
+
+    #[inline(always)]
+    fn get(&self, i: usize) -> Operand {
+        match self.splat[i] {
+            false => Operand::Lanes(std::ptr::with_exposed_provenance(self.words[i])),
+            true => Operand::Splat(self.words[i] as u32),
+        }
+    }
+}
+
+impl From<[Operand; 3]> for Operands {
+    fn from(all: [Operand; 3]) -> Operands {
+        let mut operands = Operands::NONE;
+        all.into_iter().enumerate().for_each(|(i, operand)| operands.set(i, operand));
+        operands
+    }
+}
+
+/// Computes `out[i] = prim(operand 0 [i], ...)` for `len` lanes; operands beyond the primitive's arity are ignored.
 ///
 /// # Safety
 /// `isa.supported()`; `out` and the used operands are valid for `len` lanes; `out` equals an operand's pointer or does
 /// not overlap it.
 #[inline]
-pub unsafe fn apply(isa: Isa, prim: Prim, out: *mut f32, operands: [Operand; 3], len: usize) {
+pub unsafe fn apply(isa: Isa, prim: Prim, out: *mut f32, operands: &Operands, len: usize) {
     // SAFETY: forwarded contract.
-    unsafe { launch(isa, &Apply { prim, out, operands: &operands, len }) }
+    unsafe { launch(isa, &Apply { prim, out, operands, len }) }
 }
 
 struct Apply<'a> {
     prim: Prim,
     out: *mut f32,
-    operands: &'a [Operand; 3],
+    operands: &'a Operands,
     len: usize,
 }
 
@@ -182,7 +221,7 @@ impl Apply<'_> {
     unsafe fn unary<S: Simd, O: Op>(&self) {
         // SAFETY: forwarded contract.
         unsafe {
-            match self.operands[0] {
+            match self.operands.get(0) {
                 Operand::Lanes(a) => self.sweep::<S, O>(Run(a), UNUSED, UNUSED),
                 Operand::Splat(a) => self.sweep::<S, O>(Value(a), UNUSED, UNUSED),
             }
@@ -194,7 +233,7 @@ impl Apply<'_> {
         use Operand::{Lanes, Splat};
         // SAFETY: forwarded contract.
         unsafe {
-            match (self.operands[0], self.operands[1]) {
+            match (self.operands.get(0), self.operands.get(1)) {
                 (Lanes(a), Lanes(b)) => self.sweep::<S, O>(Run(a), Run(b), UNUSED),
                 (Lanes(a), Splat(b)) => self.sweep::<S, O>(Run(a), Value(b), UNUSED),
                 (Splat(a), Lanes(b)) => self.sweep::<S, O>(Value(a), Run(b), UNUSED),
@@ -208,7 +247,7 @@ impl Apply<'_> {
         use Operand::{Lanes, Splat};
         // SAFETY: forwarded contract.
         unsafe {
-            match (self.operands[0], self.operands[1], self.operands[2]) {
+            match (self.operands.get(0), self.operands.get(1), self.operands.get(2)) {
                 (Lanes(a), Lanes(b), Lanes(c)) => self.sweep::<S, O>(Run(a), Run(b), Run(c)),
                 (Lanes(a), Lanes(b), Splat(c)) => self.sweep::<S, O>(Run(a), Run(b), Value(c)),
                 (Lanes(a), Splat(b), Lanes(c)) => self.sweep::<S, O>(Run(a), Value(b), Run(c)),

@@ -5,7 +5,7 @@ use raygrad_compiler::scalar::Prim;
 fn run(isa: Isa, prim: Prim, operands: [Operand; 3], len: usize) -> Vec<f32> {
     let mut out = vec![0.0; len];
     // SAFETY: `isa` is available; the tests pass operands of at least `len` lanes.
-    unsafe { apply(isa, prim, out.as_mut_ptr(), operands, len) };
+    unsafe { apply(isa, prim, out.as_mut_ptr(), &operands.into(), len) };
     out
 }
 
@@ -265,7 +265,7 @@ fn operand_kinds_lengths_and_aliasing_agree() {
                     let bits = |v: &[f32]| v.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
                     let mut out = vec![99.0; len + 20];
                     // SAFETY: all runs have `len` lanes, `out` more.
-                    unsafe { apply(isa, prim, out.as_mut_ptr(), operands, len) };
+                    unsafe { apply(isa, prim, out.as_mut_ptr(), &operands.into(), len) };
                     assert_eq!(bits(&out[..len]), bits(&reference), "{isa} {prim:?} kinds {kinds} len {len}");
                     assert!(out[len..].iter().all(|&v| v == 99.0), "{isa} {prim:?} writes beyond {len} lanes");
                     if is_run(0) {
@@ -273,7 +273,7 @@ fn operand_kinds_lengths_and_aliasing_agree() {
                         let mut operands = operands;
                         operands[0] = Operand::Lanes(aliased.as_mut_ptr());
                         // SAFETY: as above; `out` is exactly the first operand.
-                        unsafe { apply(isa, prim, aliased.as_mut_ptr(), operands, len) };
+                        unsafe { apply(isa, prim, aliased.as_mut_ptr(), &operands.into(), len) };
                         assert_eq!(bits(&aliased), bits(&reference), "{isa} {prim:?} in place");
                     }
                 }

@@ -5,7 +5,7 @@
 
 use super::lower::lane_program;
 use super::*;
-use crate::cpu::{Isa, Operand, apply};
+use crate::cpu::{Isa, Operand, Operands, apply};
 use raygrad_compiler::plan::Program;
 use raygrad_compiler::plan::region::{InstId, Region, RegionOp, Store};
 
@@ -214,13 +214,16 @@ impl Flat {
                     let last = j + 1 == program.code.len();
                     let out =
                         if last { values.wrapping_add(i * BLOCK) } else { temps.wrapping_add(*to as usize * BLOCK) };
-                    let source = |s: Source| match s {
-                        Source::Const(bits) => Operand::Splat(bits),
-                        Source::Temp(t) => Operand::Lanes(temps.wrapping_add(t as usize * BLOCK)),
-                        Source::Arg(a) => args[a as usize],
-                    };
+                    let mut operands = Operands::NONE;
+                    for (i, source) in sources.iter().enumerate() {
+                        match *source {
+                            Source::Const(bits) => operands.set(i, Operand::Splat(bits)),
+                            Source::Temp(t) => operands.set(i, Operand::Lanes(temps.wrapping_add(t as usize * BLOCK))),
+                            Source::Arg(a) => operands.set(i, args[a as usize]),
+                        }
+                    }
                     // SAFETY: blocks of `len` lanes.
-                    unsafe { apply(isa, *prim, out, sources.map(source), len) };
+                    unsafe { apply(isa, *prim, out, &operands, len) };
                 }
             }
             for (arg, to) in &self.stores {

@@ -1,7 +1,9 @@
 //! Runs a tile program: packs weights, then works through the tiles of a chunk.
 
 use super::*;
-use crate::cpu::{Epilogue, Gemm, Isa, Operand, ROW_BLOCK, apply, gemm, outer, pack_panels, rows_max, rows_sum};
+use crate::cpu::{
+    Epilogue, Gemm, Isa, Operand, Operands, ROW_BLOCK, apply, gemm, outer, pack_panels, rows_max, rows_sum,
+};
 use raygrad_compiler::ops::sym_eig::jacobi;
 use std::ops::Range;
 
@@ -182,7 +184,7 @@ impl Tile<'_> {
                     for c in 0..x.places.len() * n {
                         let (a, b) = (self.operand(x, c / n, *full), self.operand(d, c % n, *full));
                         let out = self.at(*out).add(c * step);
-                        apply(self.isa, Prim::Mul, out, [a, b, Operand::Splat(0)], len);
+                        apply(self.isa, Prim::Mul, out, &[a, b, Operand::Splat(0)].into(), len);
                     }
                 }
                 TileOp::CumSum { from, out, reverse } => self.cumsum(from, *out, *reverse),
@@ -210,7 +212,7 @@ impl Tile<'_> {
 
     unsafe fn apply(&self, prim: Prim, out: *mut f32, a: *const f32, b: *const f32, len: usize) {
         // SAFETY: forwarded; the callers pass scratch places of `len` lanes.
-        unsafe { apply(self.isa, prim, out, [Operand::Lanes(a), Operand::Lanes(b), Operand::Splat(0)], len) }
+        unsafe { apply(self.isa, prim, out, &[Operand::Lanes(a), Operand::Lanes(b), Operand::Splat(0)].into(), len) }
     }
 
     unsafe fn operand(&self, value: &Value, channel: usize, full: bool) -> Operand {
@@ -292,23 +294,28 @@ impl Tile<'_> {
             let mut start = 0;
             while start < lanes {
                 let len = BLOCK.min(lanes - start);
-                let operand = |source: Source| match source {
-                    Source::Const(bits) => Operand::Splat(bits),
-                    Source::Temp(t) => Operand::Lanes(temps.wrapping_add(t as usize * BLOCK)),
-                    Source::Arg(a) => match run.args[a as usize] {
-                        RunArg::Lanes(place) => Operand::Lanes(self.at(place).wrapping_add(start)),
-                        // SAFETY: the place is inside the scratch.
-                        RunArg::Splat(place) => Operand::Splat(unsafe { (*self.at(place)).to_bits() }),
-                    },
-                };
                 for (i, (prim, sources, to)) in program.code.iter().enumerate() {
                     let out = if i + 1 == program.code.len() {
                         self.at(run.out).wrapping_add(start)
                     } else {
                         temps.wrapping_add(*to as usize * BLOCK)
                     };
+                    let mut operands = Operands::NONE;
+                    for (i, source) in sources.iter().enumerate() {
+                        match *source {
+                            Source::Const(bits) => operands.set(i, Operand::Splat(bits)),
+                            Source::Temp(t) => operands.set(i, Operand::Lanes(temps.wrapping_add(t as usize * BLOCK))),
+                            Source::Arg(a) => match run.args[a as usize] {
+                                RunArg::Lanes(at) => operands.set(i, Operand::Lanes(self.at(at).wrapping_add(start))),
+                                // SAFETY: the place is inside the scratch.
+                                RunArg::Splat(at) => unsafe {
+                                    operands.set(i, Operand::Splat((*self.at(at)).to_bits()));
+                                },
+                            },
+                        }
+                    }
                     // SAFETY: all operands have `len` lanes from `start`; an overwritten operand has the run's own places.
-                    unsafe { apply(self.isa, *prim, out, sources.map(operand), len) };
+                    unsafe { apply(self.isa, *prim, out, &operands, len) };
                 }
                 start += len;
             }
@@ -389,7 +396,7 @@ impl Tile<'_> {
                 unsafe {
                     let (a, b) = (self.operand(x, k, full), self.operand(w, row * columns + column, full));
                     let to = if k == 0 { out } else { product };
-                    apply(self.isa, Prim::Mul, to, [a, b, Operand::Splat(0)], len);
+                    apply(self.isa, Prim::Mul, to, &[a, b, Operand::Splat(0)].into(), len);
                     if k > 0 {
                         self.apply(Prim::Add, out, out, product, len);
                     }
