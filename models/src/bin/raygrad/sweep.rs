@@ -82,7 +82,7 @@ fn train(
     stop: &AtomicBool,
 ) -> Result<Option<Evaluation>, Error> {
     let begun = match state {
-        Progress::Done(evaluation) => return Ok(Some(evaluation)),
+        Progress::Done(evaluation) => return Ok(Some(*evaluation)),
         Progress::Begun => true,
         Progress::Open => {
             cell.clear(folder)?;
@@ -97,7 +97,7 @@ fn train(
         return Ok(None);
     }
     match cell.progress(folder)? {
-        Progress::Done(evaluation) => Ok(Some(evaluation)),
+        Progress::Done(evaluation) => Ok(Some(*evaluation)),
         _ => Ok(None),
     }
 }
