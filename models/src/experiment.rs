@@ -147,6 +147,10 @@ impl Experiment {
     pub fn trainer(&self) -> Result<Trainer, Error> {
         self.layered.validate()?;
         let settings = &self.layered.settings;
+        if self.lpips.is_some() {
+            let text = "LPIPS compares test views of an experiment in space; this one is in the plane";
+            return Err(self.layered.refuse("--lpips", text).into());
+        }
         let data = PlanarData::load(&self.layered)?;
         let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings, settings.data.patches));
         Trainer::new(settings, data, warp, self.open()?)
@@ -157,6 +161,9 @@ impl Experiment {
         self.layered.validate()?;
         let settings = &self.layered.settings;
         let data = SpaceData::load(&self.layered, &|_, _| {})?;
+        if self.lpips.is_some() {
+            Lpips::check_size(data.size.width, data.size.height)?;
+        }
         let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings, data.scene.train.len()));
         let mut explorer = Explorer::new(settings, data, warp, self.open()?)?;
         explorer.lpips = self.lpips.clone();

@@ -69,13 +69,18 @@ fn lpips_is_measured_where_weights_are_given() {
     assert_eq!(again["after"], trained["after"]);
     let without: Value = serde_json::from_str(&w.succeed(&["eval", "run", "--json"])).unwrap();
     assert!(without["after"]["mean"]["lpips"].is_null());
+    w.succeed(&["train", "tiny.toml", "--out", "planar", "--steps", "1"]);
+    let planar = ["eval", "planar", "--lpips", "weights.safetensors"];
+    mentions(&w.refuse(&planar), &["--lpips", "this one is in the plane"]);
     // Pictures too small for it, and files that are none.
     w.succeed(&["train", "space.toml", "--out", "small", "--steps", "1"]);
     mentions(&w.refuse(&["eval", "small", "--lpips", "weights.safetensors"]), &["16 x 16", "31 x 31"]);
     mentions(&w.refuse(&["eval", "run", "--lpips", "run/config.toml"]), &["not in the safetensors format"]);
     let checkpoint = "run/checkpoint-0000001.safetensors";
     mentions(&w.refuse(&["eval", "run", "--lpips", checkpoint]), &["lack the tensor `conv1.weight`"]);
-    mentions(&w.refuse(&["train", "space.toml", "--out", "new", "--lpips", "no.st"]), &["no.st"]);
+    let train = |weights| w.refuse(&["train", "space.toml", "--out", "new", "--lpips", weights]);
+    mentions(&train("weights.safetensors"), &["16 x 16", "31 x 31"]);
+    mentions(&train("no.st"), &["no.st"]);
     assert!(!w.path("new").exists());
 }
 

@@ -1,6 +1,6 @@
 //! Sweeps: the runs of a file, their tables, and going on where one was stopped.
 
-use crate::workplace::{Workplace, mentions, names};
+use crate::workplace::{Workplace, mentions, names, stderr};
 use raygrad::config::Sweep;
 use raygrad::{Experiment, Observer};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -76,6 +76,19 @@ fn a_sweep_trains_all_and_goes_on_where_it_was_stopped() {
     std::fs::write(w.path("grid.toml"), text.replace("optim.steps = 10", "optim.steps = 11")).unwrap();
     mentions(&w.refuse(&["sweep", &file, "--out", "parts"]), &["another run", "there `optim.steps` is 10, here 11"]);
     assert_eq!(csv("parts"), csv("whole"));
+}
+
+#[test]
+fn a_run_that_diverges_leaves_the_others() {
+    let w = Workplace::new();
+    let file = write_sweep(&w);
+    let text = std::fs::read_to_string(w.path("grid.toml")).unwrap();
+    std::fs::write(w.path("grid.toml"), text.replace("lr_warp = 1e-4", "lr_warp = 1e-4\nlr = 1e38")).unwrap();
+    let output = w.run(&["sweep", &file, "--out", "out"]);
+    assert_eq!(output.status.code(), Some(1));
+    mentions(&stderr(&output), &["2 of 4 runs failed: builtin-slow-s0, builtin-slow-s1", "not finite"]);
+    let csv = std::fs::read_to_string(w.path("out/sweep.csv")).unwrap();
+    assert!(csv.contains(",tiny,ours,") && !csv.contains(",slow,"), "{csv}");
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! `raygrad sweep`: runs of one file, and the papers' tables of them.
 
 use crate::progress::Progress as Shown;
-use crate::{listen, print};
+use crate::{listen, output_folder, print};
 use anyhow::bail;
 use clap::Args;
 use raygrad::config::{Sweep, SweepCell};
@@ -61,7 +61,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<ExitCode> {
             Err(error) => return Err(error.into()),
         }
     }
-    crate::output_folder(&folder)?;
+    output_folder(&folder)?;
     let (table, json) = results(&sweep, &done);
     for (ending, text) in [("csv", table.to_csv()), ("tex", table.to_latex()), ("json", json)] {
         write_atomically(&folder.join(format!("sweep.{ending}")), text.as_bytes()).map_err(Error::from)?;
