@@ -76,7 +76,18 @@ impl Experiment {
 
     /// The experiment that a run folder holds; [`Experiment::restored`] is its model.
     pub fn of_run(folder: &Path) -> Result<Experiment, Error> {
-        Ok(Experiment::of(RunFolder::settings_of_run(folder)?).out(folder).resume(true))
+        let mut layered = RunFolder::settings_of_run(folder)?;
+        // The files that a run starts from may have gone; it keeps copies of them.
+        let poses = layered.settings.scene.as_ref().map_or("truth", |s| &s.poses);
+        let perturbation = &layered.settings.data.perturbation;
+        let copies = [
+            ("scene.poses", "initial_poses.json", !["truth", "identity", "noisy"].contains(&poses)),
+            ("data.perturbation", "perturbation.json", !["drawn", ""].contains(&perturbation.as_str())),
+        ];
+        for (key, name, _) in copies.into_iter().filter(|(.., is_file)| *is_file) {
+            layered.set_text(key, &folder.join(name).to_string_lossy(), Origin::Option(name.to_string()));
+        }
+        Ok(Experiment::of(layered).out(folder).resume(true))
     }
 
     /// Sets one value, as in `optim.steps=500`.

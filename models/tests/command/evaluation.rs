@@ -37,6 +37,23 @@ fn a_run_measured_again_gives_what_training_gave() {
     mentions(&w.succeed(&["eval", "run"]), &["step 6 of 6", "rotation (deg)", &format!("{psnr:.2}")]);
 }
 
+#[test]
+fn a_run_keeps_the_files_it_started_from() {
+    let w = Workplace::in_space();
+    for (preset, key, name) in
+        [("space.toml", "scene.poses=", "initial_poses.json"), ("tiny.toml", "data.perturbation=", "perturbation.json")]
+    {
+        let (first, second) = (format!("{preset}-1"), format!("{preset}-2"));
+        w.succeed(&["train", preset, "--out", &first, "--steps", "1", "--seed", "3"]);
+        std::fs::rename(w.path(&first).join(name), w.path(name)).unwrap();
+        w.succeed(&["train", preset, "--out", &second, "--steps", "2", "--set", &format!("{key}{name}")]);
+        std::fs::remove_file(w.path(name)).unwrap();
+        let found = w.json(&format!("{second}/evaluation.json"));
+        w.succeed(&["eval", &second]);
+        assert_eq!(w.json(&format!("{second}/evaluation.json")), found);
+    }
+}
+
 /// Weights of the right shapes that mean nothing.
 fn write_weights(path: &Path) {
     let sizes = [(3, 64, 11), (64, 192, 5), (192, 384, 3), (384, 256, 3), (256, 256, 3)];
