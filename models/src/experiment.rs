@@ -82,7 +82,18 @@ impl Experiment {
 
     /// The experiment that a run folder holds; [`Experiment::restored`] is its model.
     pub fn of_run(folder: &Path) -> Result<Experiment, Error> {
-        Ok(Experiment::of(RunFolder::settings_of_run(folder)?).out(folder).resume(true))
+        let mut layered = RunFolder::settings_of_run(folder)?;
+        // The files that a run starts from may have gone; it keeps copies of them.
+        let poses = layered.settings.scene.as_ref().map_or("truth", |s| &s.poses);
+        let perturbation = &layered.settings.data.perturbation;
+        let copies = [
+            ("scene.poses", "initial_poses.json", !["truth", "identity", "noisy"].contains(&poses)),
+            ("data.perturbation", "perturbation.json", !["drawn", ""].contains(&perturbation.as_str())),
+        ];
+        for (key, name, _) in copies.into_iter().filter(|(.., is_file)| *is_file) {
+            layered.set_text(key, &folder.join(name).to_string_lossy(), Origin::Option(name.to_string()));
+        }
+        Ok(Experiment::of(layered).out(folder).resume(true))
     }
 
     /// Sets one value, as in `optim.steps=500`.
@@ -158,6 +169,10 @@ impl Experiment {
     pub fn trainer(&self) -> Result<Trainer, Error> {
         self.layered.validate()?;
         let settings = &self.layered.settings;
+        if self.lpips.is_some() {
+            let text = "LPIPS compares test views of an experiment in space; this one is in the plane";
+            return Err(self.layered.refuse("--lpips", text).into());
+        }
         let data = PlanarData::load(&self.layered)?;
         let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings, settings.data.patches));
         Trainer::new(settings, data, warp, self.open()?)
@@ -172,6 +187,9 @@ impl Experiment {
         self.layered.validate()?;
         let settings = &self.layered.settings;
         let data = SpaceData::load(&self.layered, loading)?;
+        if self.lpips.is_some() {
+            Lpips::check_size(data.size.width, data.size.height)?;
+        }
         let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings, data.scene.train.len()));
         let mut explorer = Explorer::new(settings, data, warp, self.open()?)?;
         explorer.lpips = self.lpips.clone();

@@ -16,7 +16,7 @@ pub enum Progress {
     Open,
     /// There is a checkpoint to go on from.
     Begun,
-    Done(Evaluation),
+    Done(Box<Evaluation>),
 }
 
 impl SweepCell {
@@ -39,7 +39,7 @@ impl SweepCell {
         // Written last of all, with what the run has come to.
         let ended = read::<Metrics>(&path.join("metrics.json")).is_some_and(|m| m.last.is_some());
         match read::<Evaluation>(&path.join("evaluation.json")) {
-            Some(evaluation) if ended => Ok(Progress::Done(evaluation)),
+            Some(evaluation) if ended => Ok(Progress::Done(Box::new(evaluation))),
             _ if path.join(MANIFEST).exists() => Ok(Progress::Begun),
             _ => Ok(Progress::Open),
         }

@@ -104,6 +104,7 @@ fn a_run_leaves_poses_views_and_scores() {
     let plot = std::fs::read_to_string(run.join("cameras.svg")).unwrap();
     // Before and after: a frustum of eight lines for either pose of five cameras, and a line between the two.
     assert_eq!(plot.matches("<polyline").count(), 2 * 5 * (2 * 8 + 1));
+    assert!(std::fs::read_to_string(run.join("report.html")).unwrap().contains(&plot));
     for name in
         ["initial_poses.json", "report.html", "test/000.png", "test/001_depth.png", "test_views.png", "training.png"]
     {

@@ -45,8 +45,10 @@ impl Sweep {
     pub fn load(path: &Path) -> Result<Sweep, ConfigError> {
         let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.into(), source })?;
         let file = path.to_string_lossy();
-        let (lists, rest): (Vec<Leaf>, Vec<Leaf>) =
+        let (lists, mut rest): (Vec<Leaf>, Vec<Leaf>) =
             leaves(&file, &text)?.into_iter().partition(|l| LISTS.contains(&l.key.as_str()));
+        // What is set for one preset wins over what is set for all.
+        rest.sort_by_key(|l| !l.key.starts_with("set."));
         let list = |key: &str| lists.iter().find(|l| l.key == key);
         let Some(presets) = list("presets") else {
             return Err(ConfigError::MissingOfSweep { file: file.into() });

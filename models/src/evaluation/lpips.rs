@@ -129,15 +129,22 @@ impl Lpips {
         Ok(self.per_layer(a, b)?.iter().sum())
     }
 
+    /// Whether pictures of this size can be compared.
+    ///
+    /// # Errors
+    /// If they have a side of less than 31 pixels.
+    pub fn check_size(width: usize, height: usize) -> Result<(), ImageError> {
+        let least = LEAST;
+        if width.min(height) < least { Err(ImageError::Small { width, height, least }) } else { Ok(()) }
+    }
+
     /// The five terms of the distance, from the first layer to the last.
     ///
     /// # Errors
     /// As [`Lpips::distance`].
     pub fn per_layer(&self, a: &Picture, b: &Picture) -> Result<[f64; 5], ImageError> {
         same_size(a, b)?;
-        if a.width().min(a.height()) < LEAST {
-            return Err(ImageError::Small { width: a.width(), height: a.height(), least: LEAST });
-        }
+        Lpips::check_size(a.width(), a.height())?;
         let mut terms = [0.0; 5];
         let (mut a, mut b) = (input(a), input(b));
         for ((term, layer), spec) in terms.iter_mut().zip(&self.layers).zip(&LAYERS) {

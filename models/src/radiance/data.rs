@@ -136,3 +136,36 @@ impl SpaceData {
         Ok(Measured::new(views.map(|(v, scores)| ViewScores { view: v.name.clone(), scores }).collect()))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn dtu_is_measured_by_centres_and_the_other_scenes_by_translation_vectors() {
+        let dir = tempfile::tempdir().unwrap();
+        make_scene(dir.path(), &MakeOptions { views: 12, size: 8, seed: 0 }, &|_, _| {}).unwrap();
+        let mut layered = Layered::load("l2g-small").unwrap();
+        for set in [&format!("scene.path={}", dir.path().display()), "scene.image_size=[8,8]"] {
+            layered.set(set).unwrap();
+        }
+        let mut data = SpaceData::load(&layered, &|_, _| {}).unwrap();
+        let truth = data.truth.clone().unwrap();
+        // Cameras turned about their own centres, in a world of another place and scale.
+        let turn = Pose::exp(&[0.0, 0.1, 0.0, 0.0, 0.0, 0.0]);
+        let world = Similarity { scale: 2.0, rotation: turn.rotation, ..Similarity::identity() };
+        let found = world.align(&truth.iter().map(|p| turn.after(p)).collect::<Vec<_>>());
+        let of = |data: &SpaceData| {
+            let mean = data.pose_scores(&found).unwrap().mean;
+            (mean.rotation_error_deg.unwrap(), mean.translation_error_x100.unwrap())
+        };
+        let (degrees, vectors) = of(&data);
+        assert!((degrees - 0.1f64.to_degrees()).abs() < 1e-6 && vectors > 30.0, "{degrees} {vectors}");
+        data.scene.layout = Layout::Dtu;
+        assert_eq!(data.alignment(), Alignment::Umeyama);
+        let (degrees, centers) = of(&data);
+        assert!((degrees - 0.1f64.to_degrees()).abs() < 1e-6 && centers < 1e-3, "{degrees} {centers}");
+        data.truth = None;
+        assert_eq!(data.pose_scores(&found).unwrap(), Measured::default());
+    }
+}

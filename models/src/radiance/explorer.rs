@@ -251,7 +251,7 @@ impl Training for Explorer {
         let entry = self.measure()?;
         metrics.last = Some(Final { entry, seconds: seconds(), warps: vec![] });
         let written = results::write_evaluation(folder, self, &|_, _| {})?;
-        results::write_report(folder, layered, self, metrics, written.views)?;
+        results::write_report(folder, layered, self, metrics, &written)?;
         self.evaluation = Some(written.evaluation);
         Ok(())
     }

@@ -23,6 +23,8 @@ pub struct Written {
     pub evaluation: Evaluation,
     /// Some test views with their photos and depths, as one PNG.
     pub views: Option<Vec<u8>>,
+    /// The cameras before and after, as SVG.
+    pub cameras: String,
 }
 
 /// What the run starts from, before it begins.
@@ -71,9 +73,10 @@ pub fn write_evaluation(
         folder.write("test_views.png", png)?;
     }
     write_poses(folder, &explorer.data, &found)?;
-    folder.write("cameras.svg", cameras(&explorer.data, &found)?.as_bytes())?;
+    let cameras = cameras(&explorer.data, &found)?;
+    folder.write("cameras.svg", cameras.as_bytes())?;
     folder.write("evaluation.json", found.evaluation.to_json().as_bytes())?;
-    Ok(Written { evaluation: found.evaluation, views })
+    Ok(Written { evaluation: found.evaluation, views, cameras })
 }
 
 /// `poses.json`: the poses found, in the learned world and aligned with the true one, world to camera, row by row.
@@ -108,11 +111,11 @@ pub fn write_report(
     layered: &Layered,
     explorer: &Explorer,
     metrics: &Metrics,
-    views: Option<Vec<u8>>,
+    written: &Written,
 ) -> Result<(), Error> {
     let animation = animation(folder, explorer.steps_done())?;
     let mut pictures = vec![];
-    if let Some(png) = &views {
+    if let Some(png) = &written.views {
         let caption = "Test views: the photo, the same rendered by the model, and its inverse depth.";
         pictures.push(Picture { title: "Views", caption, png });
     }
@@ -122,6 +125,8 @@ pub fn write_report(
     }
     let config = toml::to_string(&layered.settings).unwrap_or_default();
     let device = explorer.learner().device_name();
-    let report = Report { title: &layered.name, device: &device, metrics, pictures, config: &config };
+    let caption = "Cameras before and after: where they are taken to be (teal), where they are (purple), and the way between (red).";
+    let drawings = vec![(caption, written.cameras.as_str())];
+    let report = Report { title: &layered.name, device: &device, metrics, pictures, drawings, config: &config };
     Ok(folder.write("report.html", report.to_html()?.as_bytes())?)
 }

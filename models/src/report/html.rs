@@ -21,6 +21,8 @@ pub struct Report<'a> {
     pub device: &'a str,
     pub metrics: &'a Metrics,
     pub pictures: Vec<Picture<'a>>,
+    /// Drawings (SVG), after their captions.
+    pub drawings: Vec<(&'a str, &'a str)>,
     /// The resolved settings.
     pub config: &'a str,
 }
@@ -74,6 +76,9 @@ impl Report<'_> {
                 "<figure><img alt=\"{title}\" src=\"data:image/png;base64,{data}\">\
                  <figcaption><b>{title}.</b> {caption}</figcaption></figure>"
             );
+        }
+        for (caption, svg) in &self.drawings {
+            let _ = write!(page, "<figure>{svg}<figcaption>{caption}</figcaption></figure>");
         }
         page.push_str("</div><h2>Training</h2><div class=grid>");
         for (caption, svg) in self.plots()? {

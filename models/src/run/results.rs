@@ -40,7 +40,7 @@ pub fn write_evaluation(
     let corners: &[f64] = found.entry.corners().map_or(&[], |c| &c.per_patch);
     let patch = |(i, error): (usize, &f64)| {
         let scores = Scores { corner_error_px: Some(*error), ..Scores::default() };
-        ViewScores { view: format!("patch {}", i + 1), scores }
+        ViewScores { view: format!("patch {i}"), scores }
     };
     let mut cameras = Measured::new(corners.iter().enumerate().map(patch).collect());
     cameras.mean.patch_psnr_db = Some(found.entry.psnr_db());
@@ -103,6 +103,7 @@ pub fn write_results(
         device: &trainer.learner().device_name(),
         metrics,
         pictures: shown,
+        drawings: vec![],
         config: &config,
     };
     let report = report.to_html()?;

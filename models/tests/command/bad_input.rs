@@ -1,13 +1,6 @@
 //! Bad input: one clear message, exit code 2, nothing half-written.
 
-use crate::workplace::{Workplace, names, stderr};
-
-#[track_caller]
-fn mentions(text: &str, parts: &[&str]) {
-    for part in parts {
-        assert!(text.contains(part), "expected `{part}` in: {text}");
-    }
-}
+use crate::workplace::{Workplace, mentions, names, stderr};
 
 #[test]
 fn images_that_cannot_be_used() {

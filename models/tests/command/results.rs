@@ -5,10 +5,6 @@ use serde_json::Value;
 use std::io::{BufRead, BufReader};
 use std::process::Stdio;
 
-fn json(w: &Workplace, name: &str) -> Value {
-    serde_json::from_slice(&std::fs::read(w.path(name)).unwrap()).unwrap()
-}
-
 #[test]
 fn a_run_leaves_metrics_pictures_checkpoint_and_report() {
     let w = Workplace::new();
@@ -33,7 +29,7 @@ fn a_run_leaves_metrics_pictures_checkpoint_and_report() {
         "warp_field.png",
     ];
     assert_eq!(found, expected);
-    let metrics = json(&w, "run/metrics.json");
+    let metrics = w.json("run/metrics.json");
     let steps: Vec<u64> = metrics["steps"].as_array().unwrap().iter().map(|s| s["step"].as_u64().unwrap()).collect();
     assert_eq!(steps, [4, 8, 12]);
     for entry in metrics["steps"].as_array().unwrap().iter().chain([&metrics["final"]]) {
@@ -50,7 +46,7 @@ fn a_run_leaves_metrics_pictures_checkpoint_and_report() {
     assert!(!report.contains("src=\"http"), "the report needs no network");
     // The resolved settings are an experiment of their own: the same run again.
     w.succeed(&["train", "run/config.toml", "--out", "again"]);
-    assert_eq!(json(&w, "again/metrics.json")["steps"], metrics["steps"]);
+    assert_eq!(w.json("again/metrics.json")["steps"], metrics["steps"]);
 }
 
 #[test]
@@ -86,11 +82,11 @@ fn presets_perturbations_and_methods() {
         let mut args = vec!["train", "tiny.toml", "--perturbation", "l2g/perturbation.json", "--out", &out];
         args.extend(variant.iter().flat_map(|v| ["--set", v]));
         w.succeed(&args);
-        let perturbation = |run: &str| json(&w, &format!("{run}/perturbation.json"))["perturbation"].clone();
+        let perturbation = |run: &str| w.json(&format!("{run}/perturbation.json"))["perturbation"].clone();
         assert_eq!(perturbation(&out), perturbation("l2g"));
     }
     // Known warps are exact.
-    assert!(json(&w, "variant1/metrics.json")["final"]["corner_error_px"]["mean"].as_f64().unwrap() < 1e-3);
+    assert!(w.json("variant1/metrics.json")["final"]["corner_error_px"]["mean"].as_f64().unwrap() < 1e-3);
 }
 
 #[test]
@@ -120,14 +116,14 @@ fn an_interrupted_run_resumes_bit_by_bit() {
     assert!(kill.success());
     lines.for_each(drop);
     assert_eq!(child.wait().unwrap().code(), Some(130));
-    let done = json(&w, "parts/checkpoint.json")["step"].as_u64().unwrap();
+    let done = w.json("parts/checkpoint.json")["step"].as_u64().unwrap();
     assert!(done > 0 && done < 400, "stopped at {done}");
-    assert!(json(&w, "parts/metrics.json")["final"].is_null());
+    assert!(w.json("parts/metrics.json")["final"].is_null());
     let mut resumed = args("parts");
     resumed.push("--resume");
     let output = w.run(&resumed);
     assert!(output.status.success(), "{}", stderr(&output));
-    assert_eq!(json(&w, "parts/metrics.json")["steps"], json(&w, "whole/metrics.json")["steps"]);
+    assert_eq!(w.json("parts/metrics.json")["steps"], w.json("whole/metrics.json")["steps"]);
     let tensors = |run: &str| std::fs::read(w.path(&format!("{run}/checkpoint-0000400.safetensors"))).unwrap();
     assert!(tensors("parts") == tensors("whole"));
     let animation = |run: &str| std::fs::read(w.path(&format!("{run}/training.png"))).unwrap();

@@ -1,5 +1,6 @@
 //! Running the command on an experiment small enough for a test.
 
+use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use tempfile::TempDir;
@@ -43,11 +44,62 @@ picture_every = 6
 checkpoint_every = 5
 "#;
 
+/// Registers five views of 16 x 16 pixels of a scene, likewise.
+const SPACE: &str = r#"
+base = "l2g-small"
+
+[scene]
+path = "scene"
+image_size = [16, 16]
+train_views = 5
+val_views = 1
+test_views = 2
+
+[train]
+rays = 20
+samples = 8
+refine_steps = 3
+
+[field]
+layers = [16, 16, 16]
+bands = 2
+
+[radiance]
+skip = [2]
+color_layers = [8]
+
+[warp]
+code = 4
+layers = [8, 8]
+skip = [1]
+
+[optim]
+steps = 6
+
+[run]
+device = "cpu"
+threads = 1
+log_every = 3
+picture_every = 0
+checkpoint_every = 2
+"#;
+
+const SETTINGS: [(&str, &str); 2] = [("tiny.toml", TINY), ("space.toml", SPACE)];
+
 impl Workplace {
     pub fn new() -> Workplace {
         let dir = tempfile::tempdir().unwrap();
-        std::fs::write(dir.path().join("tiny.toml"), TINY).unwrap();
+        for (name, text) in SETTINGS {
+            std::fs::write(dir.path().join(name), text).unwrap();
+        }
         Workplace { dir }
+    }
+
+    /// The same with a scene in the folder `scene`.
+    pub fn in_space() -> Workplace {
+        let w = Workplace::new();
+        w.succeed(&["make-scene", "scene", "--views", "5", "--size", "16"]);
+        w
     }
 
     pub fn path(&self, name: &str) -> PathBuf {
@@ -80,9 +132,14 @@ impl Workplace {
         text
     }
 
+    pub fn json(&self, name: &str) -> Value {
+        serde_json::from_slice(&std::fs::read(self.path(name)).unwrap()).unwrap()
+    }
+
     /// Names of the files and folders here, without the settings.
     pub fn left_behind(&self) -> Vec<String> {
-        let mut names: Vec<String> = names(self.dir.path()).into_iter().filter(|n| n != "tiny.toml").collect();
+        let mut names = names(self.dir.path());
+        names.retain(|n| SETTINGS.iter().all(|(file, _)| n != file));
         names.sort();
         names
     }
@@ -94,4 +151,11 @@ pub fn names(folder: &Path) -> Vec<String> {
 
 pub fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+#[track_caller]
+pub fn mentions(text: &str, parts: &[&str]) {
+    for part in parts {
+        assert!(text.contains(part), "expected `{part}` in: {text}");
+    }
 }

@@ -1,7 +1,7 @@
 //! `raygrad export`: the cameras that a run found, for other programs.
 
 use crate::held::HeldRun;
-use crate::output_folder;
+use crate::{output_folder, print};
 use clap::{Args, ValueEnum};
 use raygrad::Error;
 use raygrad::evaluation::{Colmap, ExportCamera, poses_bounds, transforms_json};
@@ -60,7 +60,7 @@ pub fn run(args: &ExportArgs) -> anyhow::Result<ExitCode> {
     let formats = if all { Format::value_variants() } else { asked };
     for format in formats {
         match format.write(&cameras, &args.out) {
-            Ok(name) => println!("{} cameras in {}", cameras.len(), args.out.join(name).display()),
+            Ok(name) => print(&format!("{} cameras in {}\n", cameras.len(), args.out.join(name).display()))?,
             // Nobody asked for this one.
             Err(Error::Export(error)) if all => eprintln!("note: left out: {error}"),
             Err(error) => return Err(error.into()),

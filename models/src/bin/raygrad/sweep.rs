@@ -1,7 +1,7 @@
 //! `raygrad sweep`: runs of one file, and the papers' tables of them.
 
 use crate::progress::Progress as Shown;
-use crate::{listen, print};
+use crate::{listen, output_folder, print};
 use anyhow::bail;
 use clap::Args;
 use raygrad::config::{Sweep, SweepCell};
@@ -61,7 +61,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<ExitCode> {
             Err(error) => return Err(error.into()),
         }
     }
-    crate::output_folder(&folder)?;
+    output_folder(&folder)?;
     let (table, json) = results(&sweep, &done);
     for (ending, text) in [("csv", table.to_csv()), ("tex", table.to_latex()), ("json", json)] {
         write_atomically(&folder.join(format!("sweep.{ending}")), text.as_bytes()).map_err(Error::from)?;
@@ -82,7 +82,7 @@ fn train(
     stop: &AtomicBool,
 ) -> Result<Option<Evaluation>, Error> {
     let begun = match state {
-        Progress::Done(evaluation) => return Ok(Some(evaluation)),
+        Progress::Done(evaluation) => return Ok(Some(*evaluation)),
         Progress::Begun => true,
         Progress::Open => {
             cell.clear(folder)?;
@@ -97,7 +97,7 @@ fn train(
         return Ok(None);
     }
     match cell.progress(folder)? {
-        Progress::Done(evaluation) => Ok(Some(evaluation)),
+        Progress::Done(evaluation) => Ok(Some(*evaluation)),
         _ => Ok(None),
     }
 }

@@ -2,6 +2,7 @@
 
 use crate::held::HeldRun;
 use crate::progress::bar;
+use crate::{output_folder, print};
 use clap::Args;
 use raygrad::Error;
 use raygrad::evaluation::{FRAMES, Video, write_video};
@@ -30,11 +31,11 @@ pub fn run(args: &VideoArgs) -> anyhow::Result<ExitCode> {
     shown.finish();
     let views = views?;
     let folder = args.out.as_ref().unwrap_or(&args.held.run);
-    crate::output_folder(folder)?;
+    output_folder(folder)?;
     for (name, frames) in [("novel_view", &views.rgb), ("novel_view_depth", &views.depth)] {
         let (Video::Mp4(path) | Video::AnimatedPng(path)) =
             write_video(frames, RATE, &folder.join(name)).map_err(Error::from)?;
-        println!("{}", path.display());
+        print(&format!("{}\n", path.display()))?;
     }
     Ok(ExitCode::SUCCESS)
 }
