@@ -80,6 +80,7 @@ pub struct TrainSettings {
     pub rays: usize,
     /// Of one ray.
     pub samples: usize,
+    pub shared_pixels: bool,
     pub stratified: bool,
     pub depth: DepthSettings,
     /// Near, far; inverse depths for `inverse`.

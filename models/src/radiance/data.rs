@@ -7,7 +7,7 @@ use crate::evaluation::{Alignment, Measured, PoseSetError, Scores, Similarity, V
 use crate::geometry::Pose;
 use crate::run::files::WriteError;
 use crate::scene::make_scene::{MakeError, MakeOptions, make_scene};
-use crate::scene::noise::{InitialPoses, NoiseError, PoseStart};
+use crate::scene::noise::{InitialPoses, NoiseError, PoseStart, Side};
 use crate::scene::{self, DepthRange, Layout, LoadOptions, Scene, SceneError, View};
 use std::path::Path;
 
@@ -93,12 +93,15 @@ impl SpaceData {
         Ok(SpaceData { size, start, truth, scene, seed })
     }
 
-    /// The settings with the scene's own depths, where they ask for them.
+    /// The settings with the scene's own depths, where they ask for them: from near to far, and two standard deviations more
+    /// on either side where the cameras start displaced by L2G's noise, since they must see the scene from there.
     pub fn with_depths(&self, settings: &Settings) -> Settings {
         let mut settings = settings.clone();
         if let Some(train) = settings.train.as_mut().filter(|t| t.depth == DepthSettings::Scene) {
+            let displaced = self.start.noise.as_ref().is_some_and(|(side, _)| *side == Side::Camera);
+            let more = if displaced { 2.0 * settings.noise.translation } else { 0.0 };
             (train.depth, train.range) = match self.scene.depth {
-                DepthRange::Metric { near, far } => (DepthSettings::Metric, [near, far]),
+                DepthRange::Metric { near, far } => (DepthSettings::Metric, [(near - more).max(0.25 * near), far + more]),
                 DepthRange::Inverse { near } => (DepthSettings::Inverse, [1.0 / near, 0.0]),
             };
         }

@@ -134,14 +134,16 @@ impl RadianceModel {
     pub fn train_step(&self) -> Step {
         let ray = Axis::new("ray", self.rays_per_view());
         let step = seeded_step();
-        let draw = random::uniform(&Axes::new([ray.clone()]), 1, PIXELS, &step);
+        let mut drawn = vec![ray.clone()];
+        drawn.extend((!self.train.shared_pixels).then(|| self.frame.clone()));
+        let draw = random::uniform(&Axes::new(drawn), 1, PIXELS, &step);
         let pixels = self.size.pixels() as f64;
         let index = (draw * pixels).clamp(0.0, pixels - 1.0).to_u32();
         let shape = Shape::new(&[&self.frame, &self.pixel], 1).with_dtype(DType::U32);
         self.step_at(&ray, &index, &on_white(&Tensor::data(IMAGES, shape).take(&index, &self.pixel)))
     }
 
-    /// One training step on the pixels `index` along `ray`, the same in every image, whose colours are `[frame, ray] x 3`.
+    /// One training step on the pixels `index` along `ray`, and along the frames if theirs differ, whose colours are `[frame, ray] x 3`.
     #[track_caller]
     pub fn step_at(&self, ray: &Axis, index: &Tensor, colors: &Tensor) -> Step {
         let intrinsics = Tensor::data(INTRINSICS, Shape::new(&[&self.frame], 4));
