@@ -62,6 +62,7 @@ mod tests {
             ("l2g-noglobal-blender", "l2g-noglobal", Some("noise per scene")),
             ("inn-llff", "inn", Some("identity")),
             ("nerf-blender", "reference", None),
+            ("garf-llff", "garf", Some("identity")),
             ("planar-barf-original", "barf", Some("homography 0.1, translation 0.2")),
             ("planar-multi-inn", "multi-inn", Some("homography 0.3, translation 0.1")),
         ] {
