@@ -57,6 +57,10 @@ fn an_interrupted_run_resumes_bit_by_bit_with_every_method() {
         &["warp.method=none", "scene.poses=truth"],
         &["warp.method=invertible", "warp.activation=softplus", "warp.inn.anneal=point-slots"],
         &["warp.method=multi-invertible"],
+        &["warp.method=global", "train.fine_samples=6", "train.density_noise=0.5", "train.opaque_background=true"],
+        &["warp.method=se3-field", "field.kind=gaussian", "field.encoding=none", "radiance.init=fan-in"],
+        // Cameras that all look the same way see nothing of the scene as it is, but everything runs.
+        &["train.ndc=true", "train.depth=metric", "train.range=[0.0, 1.0]", "scene.poses=identity"],
     ];
     for set in methods {
         let dir = tempfile::tempdir().unwrap();
@@ -136,13 +140,30 @@ fn bad_scenes_are_refused() {
     assert!(message.contains("is not a scene"), "{message}");
     let message = refused("scene.poses=nowhere.json");
     assert!(message.contains("nowhere.json"), "{message}");
-    let layered = |set: &str| {
-        let experiment =
-            Experiment::preset("l2g-small").and_then(|e| e.set("train.depth=metric")).and_then(|e| e.set(set));
-        experiment.unwrap().training().err().expect("a refusal").to_string()
-    };
-    let message = layered("train.range=[6.0, 2.0]");
-    assert!(message.contains("`train.range`") && message.contains("near < far"), "{message}");
-    let message = layered("warp.dof=8");
-    assert!(message.contains("`warp.dof`"), "{message}");
+}
+
+#[test]
+fn settings_that_do_not_fit_are_refused() {
+    for (set, expected) in [
+        (&["train.depth=metric", "train.range=[6.0, 2.0]"][..], ["`train.range`", "near < far"]),
+        (&["warp.dof=8"], ["`warp.dof`", "found 8"]),
+        (&["scene.focal=-1.0"], ["`scene.focal`", "found -1"]),
+        (&["train.fine_samples=1000"], ["`train.fine_samples`", "found 64 and 1000 more"]),
+        (&["train.ndc=true", "train.depth=inverse", "train.range=[1.0, 0.0]"], ["`train.depth`", "\"metric\""]),
+        (&["train.ndc=true", "train.depth=metric"], ["`train.range`", "found [2, 6]"]),
+        (
+            &["train.ndc=true", "train.depth=metric", "train.range=[0.0, 1.0]", "scene.train_views=9"],
+            ["`train.ndc`", "of the 9 poses"],
+        ),
+        (&["field.kind=gaussian", "field.sigma=0.0"], ["`field.sigma`", "above 0"]),
+        (&["radiance.init=zero"], ["`radiance.init`", "expected"]),
+    ] {
+        let dir = tempfile::tempdir().unwrap();
+        let experiment = set.iter().try_fold(Experiment::preset("l2g-small").unwrap(), |e, text| e.set(text));
+        let Err(error) = experiment.and_then(|e| e.out(dir.path().join("run")).train()) else {
+            panic!("{set:?} is not refused");
+        };
+        let message = error.to_string();
+        assert!(expected.iter().all(|part| message.contains(part)), "{set:?}: {message}");
+    }
 }

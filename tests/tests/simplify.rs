@@ -2,7 +2,9 @@
 
 use raygrad_compiler::Step;
 use raygrad_compiler::autodiff::grad;
+use raygrad_compiler::graph::{Axis, Tensor};
 use raygrad_compiler::ops::registry;
+use raygrad_compiler::reference::Bindings;
 use raygrad_compiler::simplify::simplify;
 use raygrad_tests::backend::reference;
 use raygrad_tests::{MidGraph, total, worst};
@@ -27,4 +29,16 @@ fn every_op_and_its_gradients_keep_their_values() {
             assert!(error < 1e-11, "{}: `{name}` changed by {error:.2e}", sample.name);
         }
     }
+}
+
+/// Two functions may each make an axis of the same name for a sum of their own.
+#[test]
+fn axes_of_one_name_stay_apart() {
+    let sum = |size: usize| {
+        let other = Axis::new("other", size);
+        Tensor::index(&other).to_f32().sum(&[&other])
+    };
+    let outputs = [3, 12].map(|n| (format!("sum to {n}"), sum(n)));
+    let simple = simplify(&Step { outputs: outputs.into(), updates: vec![] });
+    assert_eq!(reference(&simple, &Bindings::new()), [[3.0], [66.0]]);
 }

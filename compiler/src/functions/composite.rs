@@ -24,6 +24,17 @@ pub enum Spread {
     Inverse,
 }
 
+impl Spread {
+    /// The depth at `value`, which goes evenly from near to far: `value` itself, or the inverse of it plus 1e-8.
+    #[track_caller]
+    pub fn depth(self, value: &Tensor) -> Tensor {
+        match self {
+            Spread::Metric => value.clone(),
+            Spread::Inverse => 1.0 / (value + 1e-8),
+        }
+    }
+}
+
 /// What a ray sees.
 #[derive(Clone, Debug)]
 pub struct Composite {
@@ -40,11 +51,7 @@ pub struct Composite {
 #[track_caller]
 pub fn depth_samples(sample: &Axis, jitter: &Tensor, near: &Tensor, far: &Tensor, spread: Spread) -> Tensor {
     let share = (Tensor::index(sample).to_f32() + jitter) * (1.0 / sample.size() as f64);
-    let value = near + share * (far - near);
-    match spread {
-        Spread::Metric => value,
-        Spread::Inverse => 1.0 / (value + 1e-8),
-    }
+    spread.depth(&(near + share * (far - near)))
 }
 
 /// Renders samples along the axis `sample`: `color` (any number of channels), `density` and `depth` (one channel each, the

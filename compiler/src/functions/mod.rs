@@ -11,9 +11,11 @@
 //! | [`homography`] | direct linear transform |
 //! | [`image`] | bilinear lookup |
 //! | [`composite`] | depth samples and volume rendering |
+//! | [`hierarchical`] | more depth samples where a first pass found weight |
 //! | [`loss`], [`adam`] | mean squared error, the Adam update |
 pub mod adam;
 pub mod composite;
+pub mod hierarchical;
 pub mod homography;
 pub mod image;
 pub mod lie;

@@ -7,7 +7,7 @@
 mod rules;
 mod split;
 
-use crate::graph::{Tensor, topological, with_source};
+use crate::graph::{Axes, Tensor, topological, with_source};
 use crate::ops::Form;
 use crate::ops::constant::Constant;
 use crate::step::Step;
@@ -38,8 +38,8 @@ pub fn simplify(step: &Step) -> Step {
 #[derive(Default)]
 struct Pass {
     done: HashMap<u64, Tensor>,
-    /// Key and operands of every rebuilt node: common subexpressions.
-    known: HashMap<(String, Vec<u64>), Tensor>,
+    /// Key, operands and axes of every rebuilt node: common subexpressions. Keys name axes, and two axes may share a name.
+    known: HashMap<(String, Vec<u64>, Axes), Tensor>,
     changed: bool,
 }
 
@@ -67,7 +67,7 @@ impl Pass {
     }
 
     fn share(&mut self, t: Tensor) -> Tensor {
-        let key = (t.op().key(), t.inputs().iter().map(Tensor::id).collect());
+        let key = (t.op().key(), t.inputs().iter().map(Tensor::id).collect(), t.axes().clone());
         match self.known.get(&key) {
             Some(known) => {
                 self.changed |= known.id() != t.id();

@@ -1,14 +1,15 @@
 //! What papers call a run: its method, its scene, and where its poses started.
 
-use super::settings::{Encoding, Method, NoiseKind, Settings};
+use super::settings::{Encoding, FieldKind, Method, NoiseKind, Settings};
 use std::path::Path;
 
 impl Settings {
-    /// `barf`, `naive`, `l2g`, `l2g-noglobal`, `inn`, `multi-inn`, `mlp`, `implicit-mlp`, `se3-field` or `reference`.
+    /// `barf`, `garf`, `naive`, `l2g`, `l2g-noglobal`, `inn`, `multi-inn`, `mlp`, `implicit-mlp`, `se3-field` or `reference`.
     pub fn method_name(&self) -> &'static str {
         match self.warp.method {
             Method::None => "reference",
             Method::Global if self.field.encoding == Encoding::Windowed => "barf",
+            Method::Global if self.field.kind == FieldKind::Gaussian => "garf",
             Method::Global => "naive",
             Method::Local if self.loss.alignment > 0.0 => "l2g",
             Method::Local => "l2g-noglobal",
@@ -61,6 +62,7 @@ mod tests {
             ("l2g-noglobal-blender", "l2g-noglobal", Some("noise per scene")),
             ("inn-llff", "inn", Some("identity")),
             ("nerf-blender", "reference", None),
+            ("garf-llff", "garf", Some("identity")),
             ("planar-barf-original", "barf", Some("homography 0.1, translation 0.2")),
             ("planar-multi-inn", "multi-inn", Some("homography 0.3, translation 0.1")),
         ] {

@@ -71,6 +71,8 @@ pub struct SceneSettings {
     pub test_views: Count,
     /// `truth`, `identity`, `noisy`, `auto`, or a file of poses.
     pub poses: String,
+    /// In pixels of the image file; 0 where it is not given.
+    pub focal: f64,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -80,11 +82,15 @@ pub struct TrainSettings {
     pub rays: usize,
     /// Of one ray.
     pub samples: usize,
+    /// More of one ray, for a second field; 0 for none.
+    pub fine_samples: usize,
     pub shared_pixels: bool,
     pub stratified: bool,
     pub depth: DepthSettings,
     /// Near, far; inverse depths for `inverse`.
     pub range: [f64; 2],
+    /// Rays in normalised device coordinates.
+    pub ndc: bool,
     pub density_noise: f64,
     pub opaque_background: bool,
     pub refine_steps: usize,
@@ -98,6 +104,7 @@ pub struct RadianceSettings {
     pub view_dependent: bool,
     pub view_bands: usize,
     pub density: Density,
+    pub init: FieldInit,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -116,6 +123,16 @@ pub enum DepthSettings {
 pub enum Density {
     Softplus,
     Relu,
+}
+
+/// How the weights of a radiance field start.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FieldInit {
+    /// Uniform by inputs and outputs, biases zero: TensorFlow's.
+    Glorot,
+    /// Uniform by inputs, biases too: PyTorch's.
+    FanIn,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -166,6 +183,17 @@ pub struct FieldSettings {
     pub bands: usize,
     pub encoding: Encoding,
     pub window: [f64; 2],
+}
+
+impl FieldSettings {
+    /// What follows the hidden layers.
+    pub fn activation(&self) -> Activation {
+        match self.kind {
+            FieldKind::Relu => Activation::Relu,
+            FieldKind::Gaussian => Activation::Gaussian(self.sigma),
+            FieldKind::Siren => Activation::Sine(self.omega),
+        }
+    }
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -271,7 +299,7 @@ pub enum Anneal {
     PointSlots,
 }
 
-/// What a neural image is made of.
+/// What a field's hidden layers are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FieldKind {

@@ -64,6 +64,10 @@ impl Layered {
             let text = format!("expected 1 to {MAX_SIDE} rows and columns, found {h} x {w}");
             return Err(self.refuse("scene.image_size", text));
         }
+        if !(scene.focal >= 0.0 && scene.focal.is_finite()) {
+            let text = format!("expected a focal length in pixels, or 0 for none, found {}", scene.focal);
+            return Err(self.refuse("scene.focal", text));
+        }
         self.at_least("train.rays", train.rays, 1)?;
         self.at_least("train.samples", train.samples, 2)?;
         if train.samples > MAX_SAMPLES {
@@ -82,6 +86,24 @@ impl Layered {
                 _ => "[near, far] with 0 <= near < far",
             };
             return Err(self.refuse("train.range", format!("expected {rule}, found [{near}, {far}]")));
+        }
+        if train.samples + train.fine_samples > MAX_SAMPLES {
+            let text = format!(
+                "expected at most {MAX_SAMPLES} samples of a ray, found {} and {} more",
+                train.samples, train.fine_samples
+            );
+            return Err(self.refuse("train.fine_samples", text));
+        }
+        if train.ndc && train.depth != DepthSettings::Metric {
+            let text = "normalised device coordinates (`train.ndc`) have depths of their own: expected \"metric\"";
+            return Err(self.refuse("train.depth", text));
+        }
+        if train.ndc && far > 1.0 {
+            let text = format!(
+                "depths in normalised device coordinates (`train.ndc`) go from 0, the near plane, to 1, infinity; \
+                 found [{near}, {far}]"
+            );
+            return Err(self.refuse("train.range", text));
         }
         if s.warp.method != Method::None && s.warp.dof != Dof::Pose {
             return Err(

@@ -61,6 +61,11 @@ pub enum MeshError {
     Full { threshold: f64, least: f64 },
     #[error("the densities could not be computed: {0}")]
     Density(#[source] Box<dyn std::error::Error + Send + Sync>),
+    #[error(
+        "this run's field lives in normalised device coordinates (`train.ndc`), where densities are in no unit of the \
+         world: there is no mesh of it"
+    )]
+    DeviceCoordinates,
     #[error("the mesh has no surface to take points from")]
     NoSurface,
 }

@@ -1,5 +1,6 @@
 //! Fields: functions of space that are learned while frames are registered to them.
 
+mod initial;
 mod neural_image;
 mod radiance;
 

@@ -7,10 +7,11 @@
 //! Instead of rectifiers the hidden layers may have Gaussians (GARF: Chng, Ramasinghe, Sherrah, Lucey, ECCV 2022) or
 //! sines (SIREN: Sitzmann, Martel, Bergman, Lindell, Wetzstein, NeurIPS 2020); these need no encoding.
 
+use super::initial::siren;
 use crate::config::{Encoding, FieldKind, FieldSettings};
-use raygrad_compiler::functions::mlp::{Activation, Init, Mlp, MlpSpec, Parameter};
+use raygrad_compiler::Tensor;
+use raygrad_compiler::functions::mlp::{Activation, Mlp, MlpSpec, Parameter};
 use raygrad_compiler::functions::posenc::{coarse_to_fine_weights, encoded_width, positional_encoding};
-use raygrad_compiler::{Channels, Tensor};
 
 /// The network and its encoding.
 #[derive(Clone, Debug)]
@@ -28,15 +29,11 @@ impl NeuralImage {
         let mut widths = vec![inputs];
         widths.extend(&settings.layers);
         widths.push(3);
-        let hidden = match settings.kind {
-            FieldKind::Relu => Activation::Relu,
-            FieldKind::Gaussian => Activation::Gaussian(settings.sigma),
-            FieldKind::Siren => Activation::Sine(settings.omega),
-        };
+        let hidden = settings.activation();
         let network = Mlp::new(MlpSpec::new("field", &widths).hidden(hidden).output(Activation::Sigmoid));
         let network = match settings.kind {
             FieldKind::Relu | FieldKind::Gaussian => network,
-            FieldKind::Siren => sine_init(network, settings.omega),
+            FieldKind::Siren => siren(network, settings.omega, true),
         };
         let network = match settings.encoding {
             Encoding::Windowed => network.scale_first_layer((inputs as f64 / 2.0).sqrt()),
@@ -57,15 +54,4 @@ impl NeuralImage {
     pub fn parameters(&self) -> Vec<Parameter> {
         self.network.parameters.clone()
     }
-}
-
-/// SIREN's weights: uniform in `+-1 / in` in the first layer and `+-sqrt(6 / in) / omega` in the others, so that the
-/// arguments of all sines have one distribution.
-fn sine_init(mut network: Mlp, omega: f64) -> Mlp {
-    for (layer, weight) in network.parameters.iter_mut().step_by(2).enumerate() {
-        let Channels::Matrix(inputs, _) = weight.tensor.channels() else { continue };
-        let inputs = inputs as f64;
-        weight.init = Init::Uniform(if layer == 0 { 1.0 / inputs } else { (6.0 / inputs).sqrt() / omega });
-    }
-    network
 }

@@ -2,33 +2,49 @@
 //! seen from a direction.
 //!
 //! ```text
-//! h = trunk(gamma(x));  density = softplus(w h);  feature = relu(W h);  colour = sigmoid(head([feature, gamma(d)]))
+//! h = trunk(enter(x));  density = softplus(w h);  feature = act(W h);  colour = sigmoid(head([feature, enter(d)]))
 //! ```
 //!
-//! Both encodings open band by band with the progress of training. Biases start at zero and weights as Glorot and Bengio's,
-//! with gain sqrt(2) before a rectifier. The density's row and the feature's share a layer in the original: here they are
-//! two, with the same initial bounds.
+//! | `field.kind` | hidden layers | `enter` | feature |
+//! |---|---|---|---|
+//! | `relu` | rectified | positional encoding, opening band by band with the progress of training | rectified |
+//! | `gaussian` | `exp(-z^2 / (2 sigma^2))` | a layer, `exp(-(z - mean z)^2 / (2 sigma^2))`, the mean over its channels | affine |
+//! | `siren` | `sin(omega z)` | a layer, `sin(omega z)` | affine |
+//!
+//! The last two are the Gaussian field (GARF) as published with the invertible warp, and SIREN in the same place; the trunk's
+//! skips see what `enter` gives. They may have an encoding too, in front of the layer.
+//!
+//! Weights start as Glorot and Bengio's with gain sqrt(2) before a rectifier and biases at zero (`tf_init`), or as PyTorch's
+//! affine layers do; SIREN has a rule of its own. The density's row and the feature's share a layer in the original: here they
+//! are two, with the same initial bounds.
 
-use crate::config::{Density, Encoding, FieldSettings, RadianceSettings};
-use raygrad_compiler::functions::mlp::{Activation, Init, Mlp, MlpSpec, Parameter};
+use super::initial::{glorot, siren};
+use crate::config::{Density, Encoding, FieldInit, FieldKind, FieldSettings, RadianceSettings};
+use raygrad_compiler::Tensor;
+use raygrad_compiler::functions::mlp::{Activation, Mlp, MlpSpec, Parameter};
 use raygrad_compiler::functions::posenc::{coarse_to_fine_weights, encoded_width, positional_encoding};
 use raygrad_compiler::ops::pick::concat;
-use raygrad_compiler::{Channels, Tensor};
 use std::f64::consts::SQRT_2;
 
 /// The networks and their encodings.
 #[derive(Clone, Debug)]
 pub struct RadianceField {
+    points: Entrance,
+    directions: Option<Entrance>,
     trunk: Mlp,
     density: Mlp,
     feature: Mlp,
     head: Mlp,
-    encoding: Encoding,
-    bands: usize,
-    view_bands: usize,
-    window: [f64; 2],
+    settings: FieldSettings,
     activation: Density,
-    view_dependent: bool,
+}
+
+/// How points or directions enter: encoded, and in fields that are not rectified through a layer of their own.
+#[derive(Clone, Debug)]
+struct Entrance {
+    bands: usize,
+    layer: Option<Mlp>,
+    width: usize,
 }
 
 /// What the field says of points.
@@ -41,29 +57,49 @@ pub struct Radiance {
 }
 
 impl RadianceField {
-    pub fn new(field: &FieldSettings, radiance: &RadianceSettings) -> RadianceField {
-        let open = |bands: usize| if field.encoding == Encoding::None { 0 } else { bands };
-        let (bands, view_bands) = (open(field.bands), open(radiance.view_bands));
+    /// A field whose parameters are called `{name}.trunk.0.weight` and so on.
+    pub fn new(name: &str, field: &FieldSettings, radiance: &RadianceSettings) -> RadianceField {
         let width = field.layers.last().copied().unwrap_or(0);
-        let mut trunk = vec![encoded_width(3, bands)];
+        let spec =
+            |part: &str, widths: &[usize]| MlpSpec::new(format!("{name}.{part}"), widths).hidden(field.activation());
+        let started = |network: Mlp, gain: f64, raw: bool| match (field.kind, radiance.init) {
+            (FieldKind::Siren, _) => siren(network, field.omega, raw),
+            (_, FieldInit::Glorot) => glorot(network, gain),
+            (_, FieldInit::FanIn) => network,
+        };
+        let entrance = |part: &str, bands: usize| {
+            let bands = if field.encoding == Encoding::None { 0 } else { bands };
+            let inputs = encoded_width(3, bands);
+            let first = field.layers.first().copied().unwrap_or(0);
+            match field.kind {
+                FieldKind::Relu => Entrance { bands, layer: None, width: inputs },
+                FieldKind::Gaussian | FieldKind::Siren => {
+                    let layer = started(Mlp::new(spec(part, &[inputs, first])), 1.0, true);
+                    Entrance { bands, layer: Some(layer), width: first }
+                }
+            }
+        };
+        let points = entrance("points", field.bands);
+        let directions = radiance.view_dependent.then(|| entrance("directions", radiance.view_bands));
+        let mut trunk = vec![points.width];
         trunk.extend(&field.layers);
-        let seen = if radiance.view_dependent { encoded_width(3, view_bands) } else { 0 };
-        let mut head = vec![width + seen];
+        let mut head = vec![width + directions.as_ref().map_or(0, |d| d.width)];
         head.extend(&radiance.color_layers);
         head.push(3);
-        let rectified = |spec: MlpSpec| spec.output(Activation::Relu);
-        let spec = |name: &str, widths: &[usize]| MlpSpec::new(format!("field.{name}"), widths);
+        let (feature, gain) = match field.kind {
+            FieldKind::Relu => (Activation::Relu, SQRT_2),
+            FieldKind::Gaussian | FieldKind::Siren => (Activation::None, 1.0),
+        };
+        let trunk = spec("trunk", &trunk).skip(&radiance.skip).output(field.activation());
         RadianceField {
-            trunk: glorot(Mlp::new(rectified(spec("trunk", &trunk).skip(&radiance.skip))), SQRT_2),
-            density: glorot(Mlp::new(spec("density", &[width, 1])), 1.0),
-            feature: glorot(Mlp::new(rectified(spec("feature", &[width, width]))), SQRT_2),
-            head: glorot(Mlp::new(spec("color", &head).output(Activation::Sigmoid)), 1.0),
-            encoding: field.encoding,
-            bands,
-            view_bands,
-            window: field.window,
+            trunk: started(Mlp::new(trunk), SQRT_2, false),
+            density: started(Mlp::new(spec("density", &[width, 1])), 1.0, false),
+            feature: started(Mlp::new(spec("feature", &[width, width]).output(feature)), gain, false),
+            head: started(Mlp::new(spec("color", &head).output(Activation::Sigmoid)), 1.0, false),
+            points,
+            directions,
+            settings: field.clone(),
             activation: radiance.density,
-            view_dependent: radiance.view_dependent,
         }
     }
 
@@ -78,8 +114,8 @@ impl RadianceField {
         }
         let density = self.activate(&raw);
         let mut feature = self.feature.apply(&hidden);
-        if self.view_dependent {
-            feature = concat([&feature, &self.encode(directions, self.view_bands, progress)]);
+        if let Some(entrance) = &self.directions {
+            feature = concat([&feature, &self.enter(entrance, directions, progress)]);
         }
         Radiance { density, color: self.head.apply(&feature) }
     }
@@ -92,7 +128,7 @@ impl RadianceField {
 
     #[track_caller]
     fn hidden(&self, points: &Tensor, progress: &Tensor) -> Tensor {
-        self.trunk.apply(&self.encode(points, self.bands, progress))
+        self.trunk.apply(&self.enter(&self.points, points, progress))
     }
 
     #[track_caller]
@@ -104,27 +140,23 @@ impl RadianceField {
     }
 
     pub fn parameters(&self) -> Vec<Parameter> {
-        [&self.trunk, &self.density, &self.feature, &self.head].iter().flat_map(|m| m.parameters.clone()).collect()
+        let entrances = [Some(&self.points), self.directions.as_ref()].into_iter().flatten();
+        let entrances = entrances.filter_map(|e| e.layer.as_ref());
+        let networks = entrances.chain([&self.trunk, &self.density, &self.feature, &self.head]);
+        networks.flat_map(|m| m.parameters.clone()).collect()
     }
 
     #[track_caller]
-    fn encode(&self, x: &Tensor, bands: usize, progress: &Tensor) -> Tensor {
-        let [start, end] = self.window;
-        let windowed = self.encoding == Encoding::Windowed && bands > 0;
-        let weights = windowed.then(|| coarse_to_fine_weights(progress, bands, start, end));
-        positional_encoding(x, bands, weights.as_ref())
+    fn enter(&self, entrance: &Entrance, x: &Tensor, progress: &Tensor) -> Tensor {
+        let [start, end] = self.settings.window;
+        let windowed = self.settings.encoding == Encoding::Windowed && entrance.bands > 0;
+        let weights = windowed.then(|| coarse_to_fine_weights(progress, entrance.bands, start, end));
+        let encoded = positional_encoding(x, entrance.bands, weights.as_ref());
+        let Some(layer) = &entrance.layer else { return encoded };
+        let z = layer.apply(&encoded);
+        match self.settings.kind {
+            FieldKind::Gaussian => (&z - z.mean_channels()).gaussian(self.settings.sigma),
+            FieldKind::Relu | FieldKind::Siren => self.settings.activation().apply(&z),
+        }
     }
-}
-
-/// Glorot's initial weights, of gain sqrt(2) in hidden layers and of `last` in the last one; biases of zero.
-fn glorot(mut network: Mlp, last: f64) -> Mlp {
-    let layers = network.layers();
-    for (i, p) in network.parameters.iter_mut().enumerate() {
-        let gain = if i / 2 + 1 == layers { last } else { SQRT_2 };
-        p.init = match p.tensor.channels() {
-            Channels::Matrix(inputs, outputs) => Init::glorot(gain, inputs, outputs),
-            Channels::Vector(_) => Init::Zero,
-        };
-    }
-    network
 }

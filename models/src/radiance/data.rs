@@ -59,6 +59,7 @@ impl SpaceData {
             train_limit: wanted.train_views.limit(),
             val_limit: wanted.val_views.limit(),
             test_limit: wanted.test_views.limit(),
+            focal: (wanted.focal > 0.0).then_some(wanted.focal),
             no_train_depths: true,
             ..LoadOptions::default()
         };
@@ -89,6 +90,17 @@ impl SpaceData {
             }
             (file, _) => PoseStart::load(Path::new(file), names())?,
         };
+        if settings.train.as_ref().is_some_and(|t| t.ndc) {
+            let away = start.poses.iter().filter(|p| p.rotation[(2, 2)] <= 0.0).count();
+            if away > 0 {
+                let text = format!(
+                    "normalised device coordinates are for forward-facing scenes, whose cameras look along +z: {away} of \
+                     the {} poses that training starts from look the other way",
+                    start.poses.len()
+                );
+                return Err(layered.refuse("train.ndc", text).into());
+            }
+        }
         let size = ImageSize { height, width };
         Ok(SpaceData { size, start, truth, scene, seed })
     }
@@ -101,7 +113,9 @@ impl SpaceData {
             let displaced = self.start.noise.as_ref().is_some_and(|(side, _)| *side == Side::Camera);
             let more = if displaced { 2.0 * settings.noise.translation } else { 0.0 };
             (train.depth, train.range) = match self.scene.depth {
-                DepthRange::Metric { near, far } => (DepthSettings::Metric, [(near - more).max(0.25 * near), far + more]),
+                DepthRange::Metric { near, far } => {
+                    (DepthSettings::Metric, [(near - more).max(0.25 * near), far + more])
+                }
                 DepthRange::Inverse { near } => (DepthSettings::Inverse, [1.0 / near, 0.0]),
             };
         }

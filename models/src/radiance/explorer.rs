@@ -213,7 +213,7 @@ impl Training for Explorer {
         self.learner.check_finite("a pose", &numbers)?;
         let errors = self.data.pose_scores(&found).map_err(SpaceDataError::from)?.mean;
         let measured = Measured::Space {
-            psnr_db: psnr(loss.get("render").copied().unwrap_or(1.0)),
+            psnr_db: psnr(loss.get("render_fine").or(loss.get("render")).copied().unwrap_or(1.0)),
             rotation_error_deg: errors.rotation_error_deg,
             translation_error_x100: errors.translation_error_x100,
         };
@@ -229,8 +229,9 @@ impl Training for Explorer {
         self.rays
     }
     fn work(&self) -> String {
-        let samples = self.settings.train.as_ref().map_or(0, |t| t.samples);
-        format!("{} rays of {samples} samples", self.rays)
+        let (samples, fine) = self.settings.train.as_ref().map_or((0, 0), |t| (t.samples, t.fine_samples));
+        let more = if fine > 0 { format!(" + {fine}") } else { String::new() };
+        format!("{} rays of {samples}{more} samples", self.rays)
     }
     fn write_data(&self, folder: &RunFolder) -> Result<(), Error> {
         results::write_data(folder, &self.data)

@@ -3,7 +3,7 @@
 use super::data::SpaceDataError;
 use super::explorer::Explorer;
 use crate::Error;
-use crate::evaluation::{Mesh, MeshOptions};
+use crate::evaluation::{Mesh, MeshError, MeshOptions};
 use crate::training::Training;
 use nalgebra::Vector3;
 
@@ -13,8 +13,12 @@ impl Explorer {
     /// densities are there.
     ///
     /// # Errors
-    /// If the options make no grid, or nothing in it, or all of it, is denser than the threshold.
+    /// If the options make no grid, or nothing in it, or all of it, is denser than the threshold, or the field lives in
+    /// normalised device coordinates.
     pub fn mesh(&mut self, options: &MeshOptions, progress: &dyn Fn(usize, usize)) -> Result<Mesh, Error> {
+        if self.settings.train.as_ref().is_some_and(|t| t.ndc) {
+            return Err(MeshError::DeviceCoordinates.into());
+        }
         let poses = self.poses()?;
         let similarity = self.data.similarity(&poses).map_err(SpaceDataError::from)?;
         let (mut done, all) = (0, options.points.iter().product());

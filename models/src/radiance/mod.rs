@@ -8,6 +8,7 @@ mod mesh;
 pub mod model;
 mod novel_views;
 pub mod rays;
+mod rendering;
 pub mod results;
 
 pub use data::SpaceData;

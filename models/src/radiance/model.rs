@@ -6,19 +6,20 @@
 //! render = mean |Render(w(r)) - c|^2,   alignment = mean |w(x) - T_b x|^2 over pixels and centres,   total = render + lambda alignment
 //! ```
 //!
+//! With hierarchical sampling the fine field's picture gives a second render term, of the same weight.
+//!
 //! T_b is the rigid motion of frame b fitted to the map (L2G-NeRF's global alignment, the invertible warp's rigidity prior).
 //! Every step sees all frames, the same pixels in each. The fitted poses are kept as a state: near and far follow them in the
 //! next step, and evaluation starts from them.
 
 use super::rays::{Cameras, ImageSize, Rays, range_of};
+use super::rendering::{Purpose, Rendering, Seen};
 use crate::config::{DepthSettings, RadianceSettings, SceneSettings, Settings, TrainSettings};
-use crate::fields::RadianceField;
 use crate::scene::View;
-use crate::training::optimise::{PROGRESS, STEP, hold_first, updates};
+use crate::training::optimise::{STEP, hold_first, updates};
 use crate::warps::{self, Registration, Warp};
 use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::functions::adam::{Adam, Moments, StepScalars};
-use raygrad_compiler::functions::composite::{Composite, Spread, composite, depth_samples};
 use raygrad_compiler::functions::lie::se3_exp;
 use raygrad_compiler::functions::loss::mean_squared_error;
 use raygrad_compiler::functions::matrix::compose_poses;
@@ -54,10 +55,8 @@ pub const TWIST_BIAS2: &str = "view.bias2";
 /// Points whose density is asked for, `[place] x 3`.
 pub const DENSITY_POINTS: &str = "density.points";
 
-/// Streams of the random numbers.
+/// Stream of the random numbers that choose pixels.
 const PIXELS: u32 = 2;
-const JITTER: u32 = 3;
-const DENSITY: u32 = 4;
 
 /// Field, warp and codes, and how they make a step.
 #[derive(Clone, Debug)]
@@ -66,7 +65,7 @@ pub struct RadianceModel {
     pub size: ImageSize,
     train: TrainSettings,
     warp: Arc<dyn Warp>,
-    field: RadianceField,
+    rendering: Rendering,
     frame: Axis,
     pixel: Axis,
     code: Option<Parameter>,
@@ -93,13 +92,13 @@ impl RadianceModel {
         views: usize,
         warp: Arc<dyn Warp>,
     ) -> Result<RadianceModel, NotInSpace> {
-        let (_, train, radiance) = sections(settings)?;
+        let (_, train, _) = sections(settings)?;
         let frame = warp.frame().cloned().unwrap_or_else(|| Axis::new("frame", views));
         let pixel = Axis::new("pixel", size.pixels());
         let code = warps::codes(&*warp, &frame);
-        let field = RadianceField::new(&settings.field, radiance);
+        let rendering = Rendering::new(settings)?;
         let (settings, train) = (settings.clone(), train.clone());
-        Ok(RadianceModel { settings, size, train, warp, field, frame, pixel, code })
+        Ok(RadianceModel { settings, size, train, warp, rendering, frame, pixel, code })
     }
 
     /// The axis of the training views.
@@ -109,7 +108,7 @@ impl RadianceModel {
 
     /// Everything that is trained.
     pub fn parameters(&self) -> Vec<Parameter> {
-        self.field.parameters().into_iter().chain(self.warp_parameters()).collect()
+        self.rendering.parameters().into_iter().chain(self.warp_parameters()).collect()
     }
 
     fn warp_parameters(&self) -> Vec<Parameter> {
@@ -124,12 +123,12 @@ impl RadianceModel {
     /// Floating-point operations of one training step in the networks: six a weight and row.
     pub fn flops(&self) -> f64 {
         let rays = (self.frame.size() * self.rays_per_view()) as f64;
-        let of = |parameters: &[Parameter]| crate::planar::model::weights(parameters) as f64;
-        6.0 * rays * (self.train.samples as f64 * of(&self.field.parameters()) + of(&self.warp.parameters()))
+        let of_warp = crate::planar::model::weights(&self.warp.parameters()) as f64;
+        6.0 * rays * (self.rendering.weights_per_ray() + of_warp)
     }
 
-    /// One training step: outputs `render`, `total`, `found` and, where the warp has one, `alignment` and `penalty`; and an
-    /// update of every trained parameter.
+    /// One training step: outputs `render`, `total`, `found`, with a fine field `render_fine`, and, where the warp has one,
+    /// `alignment` and `penalty`; and an update of every trained parameter.
     #[track_caller]
     pub fn train_step(&self) -> Step {
         let ray = Axis::new("ray", self.rays_per_view());
@@ -160,12 +159,13 @@ impl RadianceModel {
             DepthSettings::Auto => range_of(&compose_poses(&rough, &known), &self.frame),
             _ => self.fixed_range(),
         };
-        let seen = self.render(&rays, &range, &Axes::new([self.frame.clone(), ray.clone()]), true);
-        let render = mean_squared_error(&seen, colors);
+        let axes = Axes::new([self.frame.clone(), ray.clone()]);
+        let seen = self.rendering.render(&rays, &intrinsics, &range, &axes, Purpose::Training);
+        let Pictures { render, fine, both } = Pictures::new(&seen, colors);
         let weight = self.settings.loss.alignment;
         let aligned = match &found.residual {
-            Some(residual) if weight > 0.0 => &render + residual * weight,
-            _ => render.clone(),
+            Some(residual) if weight > 0.0 => both + residual * weight,
+            _ => both,
         };
         let total = match &found.penalty {
             Some((penalty, weight)) if *weight > 0.0 => aligned + penalty * *weight,
@@ -173,10 +173,11 @@ impl RadianceModel {
         };
         let transform = found.transform.broadcast_to(&Axes::new([self.frame.clone()]));
         let mut outputs = vec![("render", render), ("total", total.clone()), ("found", transform.clone())];
+        outputs.extend(fine.map(|f| ("render_fine", f)));
         outputs.extend(found.residual.map(|r| ("alignment", r)));
         outputs.extend(found.penalty.map(|(p, _)| ("penalty", p)));
         let outputs = outputs.into_iter().map(|(name, t)| (name.to_string(), t)).collect();
-        let mut updates = updates(&total, &self.field.parameters(), &self.warp_parameters());
+        let mut updates = updates(&total, &self.rendering.parameters(), &self.warp_parameters());
         if let (true, Some(code)) = (pinned && self.warp.zero_code_is_identity(), &self.code) {
             hold_first(&mut updates, &code.tensor, &self.frame);
         }
@@ -190,13 +191,14 @@ impl RadianceModel {
         let point = Axis::new("view", pixels);
         let first = Tensor::per_step(VIEW_FIRST, Shape::new(&[], 1).with_dtype(DType::U32));
         let rays = self.view_rays(&point, &Tensor::index(&point).wrapping_add(&first), &view_pose());
-        let seen = self.see(&rays, &self.view_range(), &Axes::new([point]), false);
-        let outputs = [("color", seen.color), ("depth", seen.depth), ("opacity", seen.opacity)];
-        Step { outputs: outputs.map(|(name, t)| (name.to_string(), t)).into(), updates: vec![] }
+        let seen = self.see(&rays, &Axes::new([point]), Purpose::View);
+        let seen = seen.best();
+        let outputs = [("color", &seen.color), ("depth", &seen.depth), ("opacity", &seen.opacity)];
+        Step { outputs: outputs.map(|(name, t)| (name.to_string(), t.clone())).into(), updates: vec![] }
     }
 
     /// One step of the refinement of a test view's pose against its image, `P Exp(twist)` with the field as it is: Adam on
-    /// the twist alone. Output `render`.
+    /// the twist alone. Output `render`, with a fine field the sum of both pictures' terms.
     #[track_caller]
     pub fn refinement(&self) -> Step {
         let point = Axis::new("view", self.train.rays.min(self.size.pixels()));
@@ -205,9 +207,9 @@ impl RadianceModel {
         let index = (draw * pixels).clamp(0.0, pixels - 1.0).to_u32();
         let twist = Tensor::input(TWIST, Role::State, Shape::new(&[], 6));
         let rays = self.view_rays(&point, &index, &compose_poses(&view_pose(), &se3_exp(&twist)));
-        let seen = self.render(&rays, &self.view_range(), &Axes::new([point]), true);
+        let seen = self.see(&rays, &Axes::new([point]), Purpose::Refinement);
         let image = Tensor::data(VIEW_IMAGE, Shape::new(&[&self.pixel], 1).with_dtype(DType::U32));
-        let render = mean_squared_error(&seen, &on_white(&image.take(&index, &self.pixel)));
+        let render = Pictures::new(&seen, &on_white(&image.take(&index, &self.pixel))).both;
         let gradient = grad(&render, &[&twist]).remove(0);
         let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
         let scalars = StepScalars { lr: scalar(TWIST_LR), bias1: scalar(TWIST_BIAS1), bias2: scalar(TWIST_BIAS2) };
@@ -223,13 +225,12 @@ impl RadianceModel {
     #[track_caller]
     pub fn density(&self, count: usize) -> Step {
         let points = Tensor::data(DENSITY_POINTS, Shape::new(&[&Axis::new("place", count)], 3));
-        Step { outputs: vec![("density".to_string(), self.field.density_at(&points, &progress()))], updates: vec![] }
+        Step { outputs: vec![("density".to_string(), self.rendering.density_at(&points))], updates: vec![] }
     }
 
     #[track_caller]
     fn view_rays(&self, point: &Axis, index: &Tensor, pose: &Tensor) -> Rays {
-        let intrinsics = Tensor::per_step(VIEW_INTRINSICS, Shape::new(&[], 4));
-        let cameras = Cameras::new(&self.frame, point, index, self.size, &intrinsics, pose);
+        let cameras = Cameras::new(&self.frame, point, index, self.size, &view_intrinsics(), pose);
         Rays::through(&cameras.centers.position, &cameras.pixels.position)
     }
 
@@ -250,36 +251,28 @@ impl RadianceModel {
         (Tensor::scalar(near), Tensor::scalar(far))
     }
 
-    /// Colours of rays along `axes`, on the background where that is opaque.
+    /// What the rays of a rendered view see.
     #[track_caller]
-    fn render(&self, rays: &Rays, range: &(Tensor, Tensor), axes: &Axes, training: bool) -> Tensor {
-        self.see(rays, range, axes, training).color
+    fn see(&self, rays: &Rays, axes: &Axes, purpose: Purpose) -> Seen {
+        self.rendering.render(rays, &view_intrinsics(), &self.view_range(), axes, purpose)
     }
+}
 
+/// How far the pictures of the fields are from colours.
+struct Pictures {
+    render: Tensor,
+    fine: Option<Tensor>,
+    /// Their sum.
+    both: Tensor,
+}
+
+impl Pictures {
     #[track_caller]
-    fn see(&self, rays: &Rays, (near, far): &(Tensor, Tensor), axes: &Axes, training: bool) -> Composite {
-        let sample = Axis::new("sample", self.train.samples);
-        let along = axes.union(&Axes::new([sample.clone()]));
-        let jitter = match training && self.train.stratified {
-            true => random::uniform(&along, 1, JITTER, &seeded_step()),
-            false => Tensor::scalar(0.5),
-        };
-        let spread = match self.train.depth {
-            DepthSettings::Inverse => Spread::Inverse,
-            DepthSettings::Metric | DepthSettings::Auto | DepthSettings::Scene => Spread::Metric,
-        };
-        let depth = depth_samples(&sample, &jitter, near, far, spread);
-        let length = rays.length();
-        let unit = &rays.direction / length.max(&Tensor::scalar(1e-12));
-        let noise = (training && self.train.density_noise > 0.0)
-            .then(|| random::normal(&along, 1, DENSITY, &seeded_step()) * self.train.density_noise);
-        let field = self.field.at(&rays.at(&depth), &unit, &progress(), noise.as_ref());
-        let mut seen = composite(&field.color, &field.density, &depth, &length, &sample);
-        if self.train.opaque_background {
-            // White, as the images were composited on.
-            seen.color = seen.color + (1.0 - &seen.opacity);
-        }
-        seen
+    fn new(seen: &Seen, colors: &Tensor) -> Pictures {
+        let render = mean_squared_error(&seen.coarse.color, colors);
+        let fine = seen.fine.as_ref().map(|f| mean_squared_error(&f.color, colors));
+        let both = fine.as_ref().map_or(render.clone(), |f| &render + f);
+        Pictures { render, fine, both }
     }
 }
 
@@ -309,13 +302,13 @@ fn view_pose() -> Tensor {
 }
 
 #[track_caller]
-fn progress() -> Tensor {
-    Tensor::per_step(PROGRESS, Shape::new(&[], 1))
+fn view_intrinsics() -> Tensor {
+    Tensor::per_step(VIEW_INTRINSICS, Shape::new(&[], 4))
 }
 
 /// The number of the step, and which run it belongs to.
 #[track_caller]
-fn seeded_step() -> Tensor {
+pub(super) fn seeded_step() -> Tensor {
     let seed = Tensor::data(SEED, Shape::new(&[], 1).with_dtype(DType::U32));
     Tensor::per_step(STEP, Shape::new(&[], 1).with_dtype(DType::U32)).wrapping_add(&seed)
 }

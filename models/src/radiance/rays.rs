@@ -83,6 +83,40 @@ impl Rays {
     }
 }
 
+/// Depth of the near plane of normalised device coordinates.
+const NEAR: f64 = 1.0;
+/// The farthest that a depth is taken back from normalised device coordinates: so much short of 1.
+const FARTHEST: f64 = 1e-6;
+
+/// Normalised device coordinates (Mildenhall et al., NeRF, ECCV 2020, appendix C), here of cameras that look along +z from
+/// before the plane z = n = 1: a point (x, y, z) is at `(fx/cx x/z, fy/cy y/z, 1 - 2n/z)`, and what a camera sees from the plane
+/// to infinity is a cube. Rays are rays there:
+///
+/// ```text
+/// p = o + (n - o_z) / d_z d     o' = (fx/cx p_x/n, fy/cy p_y/n, -1)
+/// d' = (fx/cx (d_x/d_z - p_x/n), fy/cy (d_y/d_z - p_y/n), 2)
+/// ```
+///
+/// with depths from 0 (the plane) to 1 (infinity).
+impl Rays {
+    /// The same rays in normalised device coordinates of a lens (fx, fy, cx, cy).
+    #[track_caller]
+    pub fn to_ndc(&self, intrinsics: &Tensor) -> Rays {
+        let scale = intrinsics.slice(0..2) / intrinsics.slice(2..4);
+        let slope = self.direction.slice(0..2) / self.direction.ch(2);
+        let at = (self.origin.slice(0..2) + (NEAR - self.origin.ch(2)) * &slope) * (1.0 / NEAR);
+        let origin = concat([&(&scale * &at), &Tensor::scalar(-1.0)]);
+        Rays { origin, direction: concat([&(scale * (slope - at)), &Tensor::scalar(2.0)]) }
+    }
+
+    /// The depth along these rays of what lies at `depth` along the same rays in normalised device coordinates.
+    #[track_caller]
+    pub fn depth_of_ndc(&self, depth: &Tensor) -> Tensor {
+        let z = NEAR / (1.0 - depth).max(&Tensor::scalar(FARTHEST));
+        (z - self.origin.ch(2)) / self.direction.ch(2)
+    }
+}
+
 /// Depth range of Blender scenes, as parts of the largest distance between two cameras: 2 and 6 of 8.
 pub const NEAR_PART: f64 = 0.25;
 pub const FAR_PART: f64 = 0.75;

@@ -106,7 +106,7 @@ impl Learner {
     /// The loss terms that a program has put out.
     pub fn losses(&mut self, program: ProgramId) -> Result<BTreeMap<String, f64>, Error> {
         let mut loss = BTreeMap::new();
-        for name in ["render", "alignment", "penalty", "total"] {
+        for name in ["render", "render_fine", "alignment", "penalty", "total"] {
             if self.program(program).outputs.iter().any(|(n, _)| n == name) {
                 let value = f64::from(self.read(program, name)?[0]);
                 self.check_finite(name, &[value])?;

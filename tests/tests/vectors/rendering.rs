@@ -2,6 +2,7 @@
 
 use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::functions::composite::{Spread, composite, depth_samples};
+use raygrad_compiler::functions::hierarchical::fine_depths;
 use raygrad_compiler::graph::{Axis, Tensor};
 use raygrad_tests::vectors::{Bound, cases};
 
@@ -37,6 +38,32 @@ fn compositing() {
         for (name, values) in names.iter().chain(&slopes).zip(&found) {
             case.check(name, values);
         }
+    }
+}
+
+/// Depths of all samples, given their jitter, and depths drawn from the weights of a first pass.
+#[test]
+fn depths() {
+    for case in cases("sampling") {
+        let mut bound = Bound::default();
+        let [near, far] = [0, 1].map(|i| Tensor::scalar(case.numbers("range")[i]));
+        let from_weights = case.function == "sample_depth_from_pdf";
+        let drawn = case.sizes(if from_weights { "prob" } else { "jitter" });
+        let [batch, ray] = [("batch", 0), ("ray", 1)].map(|(name, i)| Axis::new(name, drawn.get(i).map_or(1, |n| *n)));
+        let sample = Axis::new("sample", case.count("S"));
+        let axes = [&batch, &ray, &sample];
+        let depth = if from_weights {
+            let weights = bound.data("prob", &axes, 1, case.numbers("prob"));
+            fine_depths(&weights, &sample, &Axis::new("fine", case.count("S_fine")), &near, &far, Spread::Metric)
+        } else {
+            let jitter = match case.input("jitter").is_null() {
+                true => Tensor::scalar(0.5),
+                false => bound.data("jitter", &axes, 1, case.numbers("jitter")),
+            };
+            let spread = if case.text("param") == "inverse" { Spread::Inverse } else { Spread::Metric };
+            depth_samples(&sample, &jitter, &near, &far, spread)
+        };
+        case.check("depth", &bound.run(&[depth])[0]);
     }
 }
 
