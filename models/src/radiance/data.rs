@@ -105,17 +105,16 @@ impl SpaceData {
         Ok(SpaceData { size, start, truth, scene, seed })
     }
 
-    /// The settings with the scene's own depths, where they ask for them: from near to far, and two standard deviations more
-    /// on either side where the cameras start displaced by L2G's noise, since they must see the scene from there.
+    /// The settings with the scene's own depths, where they ask for them: from near to far, and where L2G's noise displaced
+    /// the cameras a standard deviation farther, since they must see the scene from there too. (Nearer than near lie no
+    /// samples: a camera would explain its photo by something that no other camera sees.)
     pub fn with_depths(&self, settings: &Settings) -> Settings {
         let mut settings = settings.clone();
         if let Some(train) = settings.train.as_mut().filter(|t| t.depth == DepthSettings::Scene) {
             let displaced = self.start.noise.as_ref().is_some_and(|(side, _)| *side == Side::Camera);
-            let more = if displaced { 2.0 * settings.noise.translation } else { 0.0 };
+            let farther = if displaced { settings.noise.translation } else { 0.0 };
             (train.depth, train.range) = match self.scene.depth {
-                DepthRange::Metric { near, far } => {
-                    (DepthSettings::Metric, [(near - more).max(0.25 * near), far + more])
-                }
+                DepthRange::Metric { near, far } => (DepthSettings::Metric, [near, far + farther]),
                 DepthRange::Inverse { near } => (DepthSettings::Inverse, [1.0 / near, 0.0]),
             };
         }
