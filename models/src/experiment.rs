@@ -87,7 +87,7 @@ impl Experiment {
         let poses = layered.settings.scene.as_ref().map_or("truth", |s| &s.poses);
         let perturbation = &layered.settings.data.perturbation;
         let copies = [
-            ("scene.poses", "initial_poses.json", !["truth", "identity", "noisy"].contains(&poses)),
+            ("scene.poses", "initial_poses.json", !["truth", "identity", "noisy", "auto"].contains(&poses)),
             ("data.perturbation", "perturbation.json", !["drawn", ""].contains(&perturbation.as_str())),
         ];
         for (key, name, _) in copies.into_iter().filter(|(.., is_file)| *is_file) {

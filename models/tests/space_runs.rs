@@ -148,7 +148,7 @@ fn settings_that_do_not_fit_are_refused() {
         (&["train.depth=metric", "train.range=[6.0, 2.0]"][..], ["`train.range`", "near < far"]),
         (&["warp.dof=8"], ["`warp.dof`", "found 8"]),
         (&["scene.focal=-1.0"], ["`scene.focal`", "found -1"]),
-        (&["train.fine_samples=1000"], ["`train.fine_samples`", "found 64 and 1000 more"]),
+        (&["train.fine_samples=1000"], ["`train.fine_samples`", "found 48 and 1000 more"]),
         (&["train.ndc=true", "train.depth=inverse", "train.range=[1.0, 0.0]"], ["`train.depth`", "\"metric\""]),
         (&["train.ndc=true", "train.depth=metric"], ["`train.range`", "found [2, 6]"]),
         (

@@ -1,6 +1,7 @@
 //! What papers call a run: its method, its scene, and where its poses started.
 
-use super::settings::{Encoding, FieldKind, Method, NoiseKind, Settings};
+use super::settings::{Encoding, FieldKind, Method, NoiseKind, SceneSettings, Settings};
+use crate::scene::Layout;
 use std::path::Path;
 
 impl Settings {
@@ -37,7 +38,11 @@ impl Settings {
     /// Where poses or patches started, as `published.toml` has it; nothing where the true ones are known.
     pub fn start_name(&self) -> Option<String> {
         let noise = &self.noise;
-        let of_scene = self.scene.as_ref().map(|s| (s.poses.as_str(), noise.kind));
+        let of_scene = self.scene.as_ref().map(|s| {
+            // The built-in scene, and what cannot be read, is as good as a synthetic one.
+            let layout = Layout::of(Path::new(&s.path)).unwrap_or(Layout::Blender);
+            (s.poses_in(layout), noise.kind)
+        });
         match of_scene {
             _ if self.warp.method == Method::None => None,
             None => Some(format!("homography {}, translation {}", noise.homography, noise.translation)),
@@ -46,6 +51,17 @@ impl Settings {
             Some(("noisy", NoiseKind::Barf)) => Some(format!("noise {}", noise.rotation)),
             Some(("noisy", NoiseKind::L2g)) => Some("noise per scene".to_string()),
             Some(_) => Some("colmap".to_string()),
+        }
+    }
+}
+
+impl SceneSettings {
+    /// `poses`, with "auto" replaced by what it means for a scene of this layout: the identity for captures.
+    pub fn poses_in(&self, layout: Layout) -> &str {
+        match (self.poses.as_str(), layout) {
+            ("auto", Layout::Blender | Layout::Dtu) => "noisy",
+            ("auto", _) => "identity",
+            (other, _) => other,
         }
     }
 }

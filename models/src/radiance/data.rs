@@ -75,13 +75,7 @@ impl SpaceData {
         let truth: Option<Vec<Pose>> = scene.train.iter().map(|v: &View| v.pose).collect();
         let names = || scene.train.iter().map(|v| (v.name.as_str(), v.pose));
         let (noise, seed) = (&settings.noise, settings.run.seed);
-        let captured = !matches!(scene.layout, Layout::Blender | Layout::Dtu);
-        let poses = match wanted.poses.as_str() {
-            "auto" if captured => "identity",
-            "auto" => "noisy",
-            other => other,
-        };
-        let start = match (poses, noise.kind) {
+        let start = match (wanted.poses_in(scene.layout), noise.kind) {
             ("truth", _) => InitialPoses::Truth.draw(names(), seed)?,
             ("identity", _) => InitialPoses::Identity.draw(names(), seed)?,
             ("noisy", NoiseKind::Barf) => InitialPoses::Barf { deviation: noise.rotation }.draw(names(), seed)?,
