@@ -5,9 +5,6 @@ use std::ptr::NonNull;
 
 /// Bytes of a cache line and of the widest vector.
 const ALIGN: usize = 64;
-/// Bytes of a huge page. Buffers of at least half of one are made of them: a tile's channels lie far apart, so that a
-/// layer touches more small pages than the processor remembers the addresses of.
-const HUGE_PAGE: usize = 2 << 20;
 
 /// A zero-initialised, growable `f32` buffer whose first element is 64-byte aligned. Pages of a large one take no memory
 /// before they are written.
@@ -37,15 +34,8 @@ impl AlignedVec {
         // SAFETY: `layout` has a nonzero size because `len > 0`.
         let raw = unsafe { alloc_zeroed(layout) };
         let Some(base) = NonNull::new(raw) else { handle_alloc_error(layout) };
-        let align = Self::align(len);
-        // SAFETY: less than `align` bytes on, of which the allocation has so many more than `len` floats.
-        let ptr = unsafe { base.add(base.addr().get().next_multiple_of(align) - base.addr().get()) };
-        #[cfg(target_os = "linux")]
-        if align == HUGE_PAGE {
-            let bytes = (len * size_of::<f32>()).next_multiple_of(HUGE_PAGE);
-            // SAFETY: whole pages of this very allocation; the advice changes no content. It may be declined.
-            unsafe { libc::madvise(ptr.as_ptr().cast(), bytes, libc::MADV_HUGEPAGE) };
-        }
+        // SAFETY: less than `ALIGN` bytes on, of which the allocation has so many more than `len` floats.
+        let ptr = unsafe { base.add(base.addr().get().next_multiple_of(ALIGN) - base.addr().get()) };
         AlignedVec { base, ptr: ptr.cast(), len }
     }
 
@@ -66,17 +56,11 @@ impl AlignedVec {
         self.ptr.as_ptr()
     }
 
-    /// What the address of `len` floats is a multiple of.
-    fn align(len: usize) -> usize {
-        if len >= HUGE_PAGE / 2 / size_of::<f32>() { HUGE_PAGE } else { ALIGN }
-    }
-
-    /// Room for `len` floats at an aligned address, up to the end of a page.
+    /// Room for `len` floats at an aligned address.
     fn layout(len: usize) -> Layout {
-        let align = Self::align(len);
-        let bytes = len.checked_mul(size_of::<f32>()).and_then(|b| b.checked_next_multiple_of(align));
-        let bytes = bytes.and_then(|b| b.checked_add(align)).expect("buffer size overflows");
-        Layout::from_size_align(bytes, align_of::<f32>()).expect("buffer size overflows")
+        let bytes = len.checked_mul(size_of::<f32>()).and_then(|b| b.checked_add(ALIGN));
+        Layout::from_size_align(bytes.expect("buffer size overflows"), align_of::<f32>())
+            .expect("buffer size overflows")
     }
 }
 

@@ -28,11 +28,7 @@ impl HeldRun {
             ("--device", "run.device", &self.device),
             ("--threads", "run.threads", &self.threads),
         ];
-        for (option, key, value) in options {
-            if let Some(value) = value {
-                experiment.set_option(option, key, value)?;
-            }
-        }
+        crate::set_options(&mut experiment, &options)?;
         Ok(experiment)
     }
 }

@@ -100,13 +100,19 @@ impl Choice {
             ("--device", "run.device", &self.device),
             ("--threads", "run.threads", &self.threads),
         ];
-        for (option, key, value) in options {
-            if let Some(value) = value {
-                experiment.set_option(option, key, value)?;
-            }
-        }
+        set_options(&mut experiment, &options)?;
         Ok(experiment)
     }
+}
+
+/// Sets what options of their own say: option, key, value.
+fn set_options(experiment: &mut Experiment, options: &[(&str, &str, &Option<String>)]) -> Result<(), Error> {
+    for (option, key, value) in options {
+        if let Some(value) = value {
+            experiment.set_option(option, key, value)?;
+        }
+    }
+    Ok(())
 }
 
 fn main() -> ExitCode {

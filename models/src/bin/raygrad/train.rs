@@ -32,11 +32,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     let mut experiment = args.choice.experiment()?.resume(args.resume);
     let options =
         [("--steps", "optim.steps", &args.steps), ("--perturbation", "data.perturbation", &args.perturbation)];
-    for (option, key, value) in options {
-        if let Some(value) = value {
-            experiment.set_option(option, key, value).map_err(raygrad::Error::from)?;
-        }
-    }
+    crate::set_options(&mut experiment, &options)?;
     if let Some(weights) = &args.lpips {
         experiment = experiment.lpips(weights)?;
     }
