@@ -12,3 +12,16 @@ build() {
     cargo build "${options[@]}"
     export RAYGRAD=${RAYGRAD:-$built/raygrad}
 }
+
+# One training step, planar or in space, against PyTorch and JAX in one run, alternating, on two cores.
+# RAYGRAD_PYTHON: a Python with torch, jax and numpy (python3 -m venv V && V/bin/pip install torch jax numpy)
+# RAYGRAD_CPUS: the cores to use, by default 0,1
+against_peers() {
+    local work=$1 peers=${RAYGRAD_PEERS:-$root/benches/peers} pin=()
+    shift
+    case ${1:-} in "" | --*) ;; *) peers=$1; shift ;; esac
+    build --bin raygrad --example peer_step
+    if command -v taskset >/dev/null; then pin=(taskset -c "${RAYGRAD_CPUS:-0,1}"); fi
+    exec "${pin[@]}" "$built/examples/peer_step" "$work" \
+        --raygrad "$RAYGRAD" --python "${RAYGRAD_PYTHON:-python3}" --peers "$peers" "$@"
+}

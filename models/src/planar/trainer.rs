@@ -12,7 +12,6 @@ use crate::run::{RunFolder, results};
 use crate::training::learner::psnr;
 use crate::training::{Learner, Training};
 use crate::warps::{KNOWN_TRUTH, Warp};
-use raygrad_compiler::Program;
 use raygrad_runtime::{Device, ProgramId};
 use std::sync::Arc;
 
@@ -29,8 +28,6 @@ pub struct Trainer {
     frame: (View, ProgramId),
     full: (View, ProgramId),
     flops: f64,
-    /// Whether any step was done here, so that the training program has outputs.
-    stepped: bool,
 }
 
 /// The model over all pixels of all patches.
@@ -60,20 +57,16 @@ impl Trainer {
         learner.set_seed(model::SEED, settings.run.seed)?;
         let (frame, full, flops) = ((frame_view, frame), (full_view, full), model.flops());
         let settings = settings.clone();
-        let mut trainer = Trainer { data, settings, learner, train, evaluate, frame, full, flops, stepped: false };
+        let mut trainer = Trainer { data, settings, learner, train, evaluate, frame, full, flops };
         trainer.fill_data()?;
         Ok(trainer)
     }
 
-    /// The program of a training step.
-    pub fn program(&self) -> &Program {
-        self.learner.program(self.train)
-    }
-
     /// The estimated warps, as the last step saw them, or those that training starts from.
     pub fn warps(&mut self) -> Result<Vec<Transform>, Error> {
-        let program = if self.stepped { self.train } else { self.evaluate };
-        if !self.stepped {
+        let stepped = self.learner.has_stepped();
+        let program = if stepped { self.train } else { self.evaluate };
+        if !stepped {
             self.learner.run(self.evaluate)?;
         }
         Ok(self.learner.read(program, "transform")?.chunks(9).map(Transform::from_rows).collect())
@@ -128,14 +121,8 @@ impl Training for Trainer {
     fn learner_mut(&mut self) -> &mut Learner {
         &mut self.learner
     }
-    fn step(&mut self) -> Result<(), Error> {
-        self.learner.train(self.train)?;
-        self.stepped = true;
-        Ok(())
-    }
-    fn wait(&mut self) -> Result<(), Error> {
-        self.learner.read(self.train, "total")?;
-        Ok(())
+    fn training_program(&self) -> ProgramId {
+        self.train
     }
     fn measure(&mut self) -> Result<Entry, Error> {
         let (entry, _) = self.read_entry(self.train)?;
@@ -143,9 +130,6 @@ impl Training for Trainer {
     }
     fn flops(&self) -> f64 {
         self.flops
-    }
-    fn launches(&self) -> usize {
-        self.program().launches.len()
     }
     fn rows(&self) -> usize {
         self.settings.data.points_per_patch.of(self.data.grid.crop_pixels())

@@ -13,7 +13,6 @@ use crate::scene::{Intrinsics, View};
 use crate::training::learner::psnr;
 use crate::training::{Learner, Training};
 use crate::warps::Warp;
-use raygrad_compiler::Program;
 use raygrad_compiler::functions::adam::Adam;
 use raygrad_runtime::{Device, ProgramId};
 use std::sync::Arc;
@@ -98,11 +97,6 @@ impl Explorer {
             rays,
             evaluation,
         })
-    }
-
-    /// The program of a training step.
-    pub fn program(&self) -> &Program {
-        self.learner.program(self.train)
     }
 
     /// The poses of the training views, as the last step found them.
@@ -199,12 +193,8 @@ impl Training for Explorer {
     fn learner_mut(&mut self) -> &mut Learner {
         &mut self.learner
     }
-    fn step(&mut self) -> Result<(), Error> {
-        self.learner.train(self.train)
-    }
-    fn wait(&mut self) -> Result<(), Error> {
-        self.learner.read(self.train, "total")?;
-        Ok(())
+    fn training_program(&self) -> ProgramId {
+        self.train
     }
     fn measure(&mut self) -> Result<Entry, Error> {
         let loss = self.learner.losses(self.train)?;
@@ -221,9 +211,6 @@ impl Training for Explorer {
     }
     fn flops(&self) -> f64 {
         self.model.flops()
-    }
-    fn launches(&self) -> usize {
-        self.program().launches.len()
     }
     fn rows(&self) -> usize {
         self.rays

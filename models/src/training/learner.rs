@@ -18,12 +18,14 @@ pub struct Learner {
     optim: Optim,
     inputs: BTreeMap<String, InputInfo>,
     step: usize,
+    /// Whether a training program's outputs are of the present state: a step was done since it began or was restored.
+    stepped: bool,
 }
 
 impl Learner {
     pub fn new(device: Device, optim: &Optim) -> Result<Learner, Error> {
         let session = Session::new(device.clone())?;
-        Ok(Learner { session, device, optim: optim.clone(), inputs: BTreeMap::new(), step: 0 })
+        Ok(Learner { session, device, optim: optim.clone(), inputs: BTreeMap::new(), step: 0, stepped: false })
     }
 
     /// Compiles one more program.
@@ -90,7 +92,13 @@ impl Learner {
         self.set_rates()?;
         self.session.run(program)?;
         self.step += 1;
+        self.stepped = true;
         Ok(())
+    }
+
+    /// Whether the outputs of the training program are those of the step that led to the present state.
+    pub fn has_stepped(&self) -> bool {
+        self.stepped
     }
 
     /// Runs a program that trains nothing, at the current progress.
@@ -144,7 +152,7 @@ impl Learner {
         for (name, saved) in &checkpoint.tensors {
             self.session.set(name, &saved.values)?;
         }
-        self.step = checkpoint.step;
+        (self.step, self.stepped) = (checkpoint.step, false);
         Ok(())
     }
 

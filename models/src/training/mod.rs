@@ -13,6 +13,7 @@ use crate::evaluation::Evaluation;
 use crate::run::checkpoint::Checkpoint;
 use crate::run::metrics::{Entry, Final, Metrics};
 use crate::run::{RunFolder, checkpoint::Saved};
+use raygrad_runtime::ProgramId;
 use std::collections::BTreeMap;
 
 /// An experiment in training, as a run sees it.
@@ -20,8 +21,14 @@ pub trait Training {
     fn learner(&self) -> &Learner;
     fn learner_mut(&mut self) -> &mut Learner;
 
+    /// The program of a training step.
+    fn training_program(&self) -> ProgramId;
+
     /// One training step. On a GPU this only submits it.
-    fn step(&mut self) -> Result<(), Error>;
+    fn step(&mut self) -> Result<(), Error> {
+        let program = self.training_program();
+        self.learner_mut().train(program)
+    }
 
     /// Losses and errors of the last step, as its forward pass saw them.
     fn measure(&mut self) -> Result<Entry, Error>;
@@ -30,7 +37,9 @@ pub trait Training {
     fn flops(&self) -> f64;
 
     /// Launches of a step.
-    fn launches(&self) -> usize;
+    fn launches(&self) -> usize {
+        self.learner().program(self.training_program()).launches.len()
+    }
 
     /// Points of a patch, or rays, in one step.
     fn rows(&self) -> usize;
@@ -62,7 +71,11 @@ pub trait Training {
     fn summary(&self, last: &Final) -> String;
 
     /// Waits until the last step is done.
-    fn wait(&mut self) -> Result<(), Error>;
+    fn wait(&mut self) -> Result<(), Error> {
+        let program = self.training_program();
+        self.learner_mut().read(program, "total")?;
+        Ok(())
+    }
 
     fn steps_done(&self) -> usize {
         self.learner().steps_done()

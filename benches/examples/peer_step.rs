@@ -1,10 +1,10 @@
-//! One planar training step: raygrad against PyTorch and JAX, alternating in one run, with the multiply-add peak of the
+//! One training step, planar or in space: raygrad against PyTorch and JAX, alternating in one run, with the multiply-add peak of the
 //! same minutes and each program's memory.
 //!
 //! Speeds on a shared machine drift: every number is a median over rounds, and every ratio is taken within a round first.
 
 use anyhow::{Context, bail};
-use clap::Parser;
+use clap::{Parser, ValueEnum};
 use raygrad_benches::{Table, median, quick};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
@@ -12,6 +12,7 @@ use std::process::Command;
 
 #[derive(Parser)]
 struct Args {
+    work: Work,
     /// The command raygrad.
     #[arg(long)]
     raygrad: PathBuf,
@@ -23,10 +24,55 @@ struct Args {
     peers: PathBuf,
     #[arg(long, default_value_t = 5)]
     rounds: usize,
-    #[arg(long, default_value_t = 4096)]
-    points: usize,
+    /// Points of a patch, or rays of a step; by default 4096 and 200 (two of each of the scene's 100 views).
+    #[arg(long)]
+    rows: Option<usize>,
     #[arg(long, default_value_t = 2)]
     threads: usize,
+}
+
+/// A step that raygrad and its peers take.
+#[derive(Clone, Copy, PartialEq, ValueEnum)]
+enum Work {
+    /// Five patches, registered by L2G; BARF's step, which has no fit, beside it.
+    Planar,
+    /// Rays of 128 samples, L2G at the paper's width.
+    Space,
+}
+
+impl Work {
+    /// What raygrad trains; the first is what peers train too.
+    fn presets(self) -> &'static [&'static str] {
+        match self {
+            Work::Planar => &["planar-l2g", "planar-barf"],
+            Work::Space => &["l2g-blender"],
+        }
+    }
+    fn rows(self) -> usize {
+        match self {
+            Work::Planar => 4096,
+            Work::Space => 200,
+        }
+    }
+    fn setting(self) -> &'static str {
+        match self {
+            Work::Planar => "data.points_per_patch",
+            Work::Space => "train.rays",
+        }
+    }
+    /// The same for the peers' scripts.
+    fn of_peers(self) -> [&'static str; 2] {
+        match self {
+            Work::Planar => ["planar", "--pixels"],
+            Work::Space => ["l2g", "--rays"],
+        }
+    }
+    fn title(self, rows: usize) -> String {
+        match self {
+            Work::Planar => format!("5 x {rows} points"),
+            Work::Space => format!("{rows} rays x 128 samples"),
+        }
+    }
 }
 
 /// One timed program in one round.
@@ -52,20 +98,19 @@ sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name='__main__')
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6, 'MB')";
 
-const OWN: [&str; 2] = ["planar-l2g", "planar-barf"];
-
 fn main() -> anyhow::Result<()> {
     let mut args = Args::parse();
     if quick() {
-        (args.rounds, args.points) = (1, 64);
+        (args.rounds, args.rows) = (1, Some(64));
     }
+    let presets = args.work.presets();
     let peers: Vec<(&str, &str)> =
         [("PyTorch", "torch"), ("JAX", "jax")].into_iter().filter(|(_, module)| args.has(module)).collect();
-    let mut own: Vec<Vec<(Timed, f64)>> = vec![vec![]; OWN.len()];
+    let mut own: Vec<Vec<(Timed, f64)>> = vec![vec![]; presets.len()];
     let mut others: Vec<Vec<Timed>> = vec![vec![]; peers.len()];
     for round in 1..=args.rounds {
-        for i in 0..OWN.len().max(peers.len()) {
-            if let Some(preset) = OWN.get(i) {
+        for i in 0..presets.len().max(peers.len()) {
+            if let Some(preset) = presets.get(i) {
                 let (timed, peak) = args.own(preset)?;
                 let share = 100.0 * timed.gflop / timed.seconds / peak;
                 eprintln!("round {round}: {preset} {:.4} s, peak {peak:.0} GFLOP/s ({share:.0} %)", timed.seconds);
@@ -83,6 +128,10 @@ fn main() -> anyhow::Result<()> {
 }
 
 impl Args {
+    fn rows(&self) -> usize {
+        self.rows.unwrap_or(self.work.rows())
+    }
+
     fn has(&self, module: &str) -> bool {
         let found = Command::new(&self.python).args(["-c", &format!("import {module}, numpy")]).output();
         let there = found.is_ok_and(|o| o.status.success());
@@ -95,9 +144,12 @@ impl Args {
     fn own(&self, preset: &str) -> anyhow::Result<(Timed, f64)> {
         let mut command = Command::new(&self.raygrad);
         command.args(["bench", preset, "--json", "--device", "cpu", "--threads", &self.threads.to_string()]);
-        command.args(["--set", &format!("data.points_per_patch={}", self.points)]);
+        command.args(["--set", &format!("{}={}", self.work.setting(), self.rows())]);
         if quick() {
             command.args(["--steps", "2"]);
+            if self.work == Work::Space {
+                command.args(["--set", "scene.image_size=[16,16]", "--set", "scene.train_views=4"]);
+            }
         }
         let bench: Bench = serde_json::from_str(&output(command)?)?;
         let timed = Timed { seconds: bench.seconds_per_step, gflop: bench.gflop_per_step, rss_mb: bench.peak_rss_mb };
@@ -107,7 +159,7 @@ impl Args {
     fn peer(&self, module: &str) -> anyhow::Result<Timed> {
         let script: &Path = &self.peers.join(format!("{module}_step.py"));
         let mut command = Command::new(&self.python);
-        command.args(["-c", MEASURED]).arg(script).args(["planar", "--pixels", &self.points.to_string()]);
+        command.args(["-c", MEASURED]).arg(script).args(self.work.of_peers()).arg(self.rows().to_string());
         if module == "torch" {
             command.args(["--threads", &self.threads.to_string()]);
         }
@@ -130,21 +182,14 @@ impl Args {
         };
         let rate = |t: &Timed| t.gflop / t.seconds;
         println!(
-            "5 x {} points, f32, {} threads, medians of {} rounds; peak {:.0} GFLOP/s (multiply-adds from registers)\n",
-            self.points,
+            "{}, f32, {} threads, medians of {} rounds; peak {:.0} GFLOP/s (multiply-adds from registers)\n",
+            self.work.title(self.rows()),
             self.threads,
             self.rounds,
             median(&peaks.concat())
         );
-        let mut table = Table::new(&[
-            "program",
-            "s/step",
-            "GFLOP/step",
-            "GFLOP/s",
-            "of the peak",
-            "memory, MB",
-            "against planar-l2g",
-        ]);
+        let mut table =
+            Table::new(&["program", "s/step", "GFLOP/step", "GFLOP/s", "of the peak", "memory, MB", "against raygrad"]);
         let mut row = |name: &str, runs: &[Timed], peaks: &[f64], against: String| {
             let shares: Vec<f64> = runs.iter().zip(peaks).map(|(t, peak)| 100.0 * rate(t) / peak).collect();
             table.row([
@@ -157,7 +202,7 @@ impl Args {
                 against,
             ]);
         };
-        for (i, preset) in OWN.iter().enumerate() {
+        for (i, preset) in self.work.presets().iter().enumerate() {
             row(&format!("raygrad {preset}"), &timed[i], &peaks[i], String::new());
         }
         for ((name, _), runs) in peers.iter().zip(others) {
