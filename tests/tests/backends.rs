@@ -1,10 +1,11 @@
 //! Every op on every backend against the f64 reference: value, first and second derivatives, mid-graph.
 
-use raygrad_compiler::Step;
 use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::ops::registry;
-use raygrad_runtime::Device;
-use raygrad_tests::backend::compare;
+use raygrad_compiler::scalar::DType;
+use raygrad_compiler::{Axis, Shape, Step, Tensor, compile};
+use raygrad_runtime::{Device, Session};
+use raygrad_tests::backend::{compare, gpu};
 use raygrad_tests::{MidGraph, total};
 
 /// Value, gradients, and the gradient of the gradients' squares.
@@ -37,4 +38,21 @@ fn every_op(device: &Device) {
 #[test]
 fn every_op_on_the_cpu() {
     every_op(&Device::cpu(Some(2)).unwrap());
+}
+
+#[test]
+fn inputs_are_set_part_by_part() {
+    for device in [Some(Device::cpu(Some(1)).unwrap()), gpu()].into_iter().flatten() {
+        let place = Axis::new("place", 7);
+        let n = Tensor::data("n", Shape::new(&[&place], 1).with_dtype(DType::U32));
+        let outputs = vec![("y".to_string(), n.wrapping_add(&Tensor::index(&place)))];
+        let program = compile(&Step { outputs, updates: vec![] }, &device.target()).unwrap();
+        let mut session = Session::new(device).unwrap();
+        let id = session.add(program).unwrap();
+        session.set_u32("n", &[10, 20, 30, 40, 50, 60, 70]).unwrap();
+        session.set_u32_from("n", 2, &[1, 2, 3]).unwrap();
+        session.set_u32_from("n", 6, &[4]).unwrap();
+        session.run(id).unwrap();
+        assert_eq!(session.read_lanes(id, "y").unwrap(), [10, 21, 3, 5, 7, 65, 10]);
+    }
 }

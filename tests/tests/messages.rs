@@ -51,6 +51,9 @@ fn running() {
     note("a value too few", session.set("x", &[0.0; 15]));
     note("integers for a float", session.set_u32("x", &[0; 16]));
     note("a float for an integer", session.set("n", &[1.0]));
+    note("part of an integer input, beyond its end", session.set_u32_from("n", 1, &[1]));
+    note("part of an input of floats", session.set_u32_from("x", 0, &[1]));
+    note("part of an input that no program has", session.set_u32_from("w", 0, &[1]));
     note("an input that no program has", session.set("w", &[1.0]));
     note("an input that no program has, read", session.get("w").map(drop));
     note("an output that the program lacks", session.read(id, "z").map(drop));

@@ -312,3 +312,27 @@ pub(super) fn seeded_step() -> Tensor {
     let seed = Tensor::data(SEED, Shape::new(&[], 1).with_dtype(DType::U32));
     Tensor::per_step(STEP, Shape::new(&[], 1).with_dtype(DType::U32)).wrapping_add(&seed)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Intrinsics;
+    use raygrad_compiler::reference::{Array, Bindings, Data, evaluate};
+
+    #[test]
+    fn packed_pixels_have_the_colors_of_the_view() {
+        let pixels = vec![[255, 128, 0, 255], [10, 200, 90, 51], [1, 2, 3, 0], [0, 0, 255, 254]];
+        let intrinsics = Intrinsics { fx: 1.0, fy: 1.0, cx: 1.0, cy: 1.0, height: 2, width: 2, distortion: None };
+        let view =
+            View { name: "v".into(), pixels, transparent: true, intrinsics, pose: None, mask: None, depth: None };
+        let all = Tensor::data("pixels", Shape::new(&[&Axis::new("pixel", 4)], 1).with_dtype(DType::U32));
+        let bindings: Bindings =
+            [("pixels".to_string(), Array::integers(all.shape(), packed(&view).collect()))].into_iter().collect();
+        let found = evaluate(&[on_white(&all)], &bindings).unwrap().remove(0);
+        let Data::F(found) = found.data else { panic!("colours are floats") };
+        assert_eq!(found.len(), 12);
+        for (a, b) in found.iter().zip(view.rgb()) {
+            assert!((a - f64::from(b)).abs() < 1e-6, "{found:?}");
+        }
+    }
+}
