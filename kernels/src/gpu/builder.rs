@@ -4,6 +4,8 @@
 //! of an inner block end with it, that loop-carried values are local variables, and that long expressions need names
 //! (parsers of the printed WGSL recurse). Equal pure expressions are built once a block, and index arithmetic on
 //! constants is folded.
+//!
+//! One file above 400 lines: all of it keeps the same few invariants of the block that is being written.
 
 use naga::{
     AddressSpace, ArraySize, BinaryOperator, Block, Expression, Function, GlobalVariable, Handle, Literal,

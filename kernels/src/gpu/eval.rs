@@ -1,5 +1,7 @@
 //! Values of a region at one position of its domain (or four side by side), built on demand, each once.
 //!
+//! One file above 400 lines: each kind of value asks for its operands by the same recursive functions.
+//!
 //! A channel is a number known now or a value of the kernel: the first unrolls, the second indexes.
 
 use super::builder::{Memory, Value};
@@ -275,7 +277,7 @@ impl<'r> Values<'r> {
     }
 
     /// `sum_i x_i W_io` (or with W transposed), where `weight` gives a channel of W.
-    #[expect(clippy::too_many_arguments)]
+    #[expect(clippy::too_many_arguments, reason = "what the three kinds of layers differ in")]
     fn contract(
         &mut self,
         e: &mut Emit,

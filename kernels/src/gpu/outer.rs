@@ -175,7 +175,7 @@ impl Outer {
     }
 
     /// Four neighbouring channels of a row, those past the end clamped to the last; zeros past the last row if asked for.
-    #[expect(clippy::too_many_arguments)]
+    #[expect(clippy::too_many_arguments, reason = "what the two operands of the product differ in")]
     fn vector(
         &self,
         e: &mut Emit,

@@ -3,6 +3,8 @@
 //! Values that a part needs and another computes go through memory: through the buffer they are written to anyway, or
 //! through scratch memory. The order of parts is: sums over what the region reads, layers, other values written, sums
 //! over what was written. A value that replaces an input which a later part still reads is put aside and copied last.
+//!
+//! One file above 400 lines: the parts are cut by one pass that holds their common state.
 
 use super::elements::{self, closure};
 use super::layout::{Layout, Limits};

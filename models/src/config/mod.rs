@@ -10,9 +10,11 @@ mod presets;
 mod settings;
 mod sweep;
 mod validate;
+mod values;
 
 pub use error::{ConfigError, Origin};
 pub use layers::{Layered, nearest};
 pub use presets::{PRESETS, Preset};
 pub use settings::*;
 pub use sweep::{Sweep, SweepCell};
+pub use values::*;

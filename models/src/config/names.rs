@@ -1,6 +1,6 @@
 //! What papers call a run: its method, its scene, and where its poses started.
 
-use super::settings::{Encoding, FieldKind, Method, NoiseKind, SceneSettings, Settings};
+use super::{Encoding, FieldKind, Method, NoiseKind, SceneSettings, Settings};
 use crate::scene::Layout;
 use std::path::Path;
 

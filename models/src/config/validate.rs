@@ -2,7 +2,7 @@
 
 use super::error::ConfigError;
 use super::layers::Layered;
-use super::settings::{Anneal, CodeKind, Count, DepthSettings, Dof, Encoding, FieldKind, ImageSize, Method, NoiseKind};
+use super::{Anneal, CodeKind, Count, DepthSettings, Dof, Encoding, FieldKind, ImageSize, Method, NoiseKind};
 
 /// Widest layer and most bands a configuration may ask for: more is a typing error, not an experiment.
 const MAX_WIDTH: usize = 4096;

@@ -9,7 +9,7 @@
 //! With hierarchical sampling the fine field's picture gives a second render term, of the same weight.
 //!
 //! T_b is the rigid motion of frame b fitted to the map (L2G-NeRF's global alignment, the invertible warp's rigidity prior).
-//! Every step sees all frames, the same pixels in each. The fitted poses are kept as a state: near and far follow them in the
+//! Every step sees all frames, by default the same pixels in each. The fitted poses are kept as a state: near and far follow them in the
 //! next step, and evaluation starts from them.
 
 use super::rays::{Cameras, ImageSize, Rays, range_of};
@@ -142,7 +142,8 @@ impl RadianceModel {
         self.step_at(&ray, &index, &on_white(&Tensor::data(IMAGES, shape).take(&index, &self.pixel)))
     }
 
-    /// One training step on the pixels `index` along `ray`, and along the frames if theirs differ, whose colours are `[frame, ray] x 3`.
+    /// One training step on the pixels `index` along `ray`, and along the frames if theirs differ; `colors` are theirs,
+    /// `[frame, ray] x 3`.
     #[track_caller]
     pub fn step_at(&self, ray: &Axis, index: &Tensor, colors: &Tensor) -> Step {
         let intrinsics = Tensor::data(INTRINSICS, Shape::new(&[&self.frame], 4));

@@ -3,7 +3,7 @@
 //! Such a region is pointwise over channels, so channels take the place of rows: each group of values of one width is
 //! worked through in blocks of lanes, reading and writing the buffers directly, by any number of threads.
 
-use super::lower::lane_program;
+use super::temporaries::lane_program;
 use super::*;
 use crate::cpu::{Isa, Operand, Operands, apply};
 use raygrad_compiler::plan::Program;

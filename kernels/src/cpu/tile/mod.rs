@@ -10,6 +10,7 @@ mod flat;
 mod fold;
 mod lower;
 mod run;
+mod temporaries;
 mod values;
 
 pub use flat::{Flat, FlatArg, split_flat};
