@@ -71,6 +71,8 @@ presets!(
     "inn-blender",
     "inn-llff",
     "inn-dtu",
+    "l2g-dtu",
+    "barf-dtu",
     "inn-llff-frozen-network",
     "inn-llff-frozen-code",
     "inn-llff-posenc",

@@ -154,6 +154,8 @@ pub struct WarpSettings {
     pub skip: Vec<usize>,
     pub bands: usize,
     pub activation: ActivationKind,
+    /// Of rotations, and of translations.
+    pub output_scale: [f64; 2],
     pub solver: Solver,
     pub inn: InnSettings,
 }

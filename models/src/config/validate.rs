@@ -175,6 +175,10 @@ impl Layered {
         if (coded && warp.code == 0) || warp.code > MAX_WIDTH {
             return Err(self.refuse("warp.code", format!("expected 1 to {MAX_WIDTH} channels, found {}", warp.code)));
         }
+        if warp.output_scale.iter().any(|x| !(*x > 0.0 && x.is_finite())) {
+            let text = format!("expected two factors above 0, found {:?}", warp.output_scale);
+            return Err(self.refuse("warp.output_scale", text));
+        }
         if warp.bands > MAX_BANDS {
             return Err(self.refuse("warp.bands", format!("expected 0 to {MAX_BANDS} bands, found {}", warp.bands)));
         }

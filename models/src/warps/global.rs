@@ -61,3 +61,42 @@ pub(super) fn move_points(dof: Dof, code: &Tensor, points: &Tensor) -> Tensor {
         Dof::Homography => apply_homography(&sl3_exp(code), points),
     }
 }
+
+/// Coordinates of a motion with their rotations and translations multiplied by the two factors of `scale`.
+#[track_caller]
+pub(super) fn scaled(dof: Dof, code: &Tensor, [rotation, translation]: [f64; 2]) -> Tensor {
+    let (r, t) = (rotation, translation);
+    let factors: &[f64] = match dof {
+        _ if (r, t) == (1.0, 1.0) => return code.clone(),
+        Dof::Rotation => &[r],
+        Dof::Translation => &[t, t],
+        Dof::Rigid => &[t, t, r],
+        Dof::Pose => &[r, r, r, t, t, t],
+        // Components 1 and 2 shift.
+        Dof::Homography => &[t, t, r, r, r, r, r, r],
+    };
+    code * Tensor::constant(factors)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad_compiler::reference::{Bindings, Data, evaluate};
+
+    #[test]
+    fn rotations_and_translations_have_their_factors() {
+        let of = |dof: Dof, scale| {
+            let code: Vec<f64> = (1..=dof.count()).map(|i| i as f64).collect();
+            let found = evaluate(&[scaled(dof, &Tensor::constant(&code), scale)], &Bindings::new()).unwrap().remove(0);
+            let Data::F(found) = found.data else { panic!("motions are floats") };
+            found
+        };
+        let scale = [10.0, 100.0];
+        assert_eq!(of(Dof::Rotation, scale), [10.0]);
+        assert_eq!(of(Dof::Translation, scale), [100.0, 200.0]);
+        assert_eq!(of(Dof::Rigid, scale), [100.0, 200.0, 30.0]);
+        assert_eq!(of(Dof::Pose, scale), [10.0, 20.0, 30.0, 400.0, 500.0, 600.0]);
+        assert_eq!(of(Dof::Homography, scale), [100.0, 200.0, 30.0, 40.0, 50.0, 60.0, 70.0, 80.0]);
+        assert_eq!(of(Dof::Pose, [1.0, 1.0]), [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]);
+    }
+}

@@ -9,7 +9,7 @@
 //! The first two are the baselines of the invertible warp's planar experiment, whose weights and widths are not published.
 //! The third is the pose network that was published together with its code.
 
-use super::global::move_points;
+use super::global::{move_points, scaled};
 use super::{Points, Warp};
 use crate::config::{ActivationKind, Dof, Solver, WarpSettings};
 use raygrad_compiler::functions::lie::se3_exp;
@@ -128,6 +128,7 @@ const POSE_SIGMA: f64 = 0.3;
 pub struct Se3Field {
     network: Mlp,
     code: usize,
+    output_scale: [f64; 2],
 }
 
 impl Se3Field {
@@ -141,13 +142,18 @@ impl Se3Field {
             other => other.of_warps(),
         };
         let spec = MlpSpec::new("warp", &widths).skip(&settings.skip).hidden(activation);
-        Se3Field { network: Mlp::new(spec), code: settings.code }
+        Se3Field { network: Mlp::new(spec), code: settings.code, output_scale: settings.output_scale }
+    }
+
+    #[track_caller]
+    fn twist(&self, code: &Tensor) -> Tensor {
+        scaled(Dof::Pose, &self.network.apply(code), self.output_scale)
     }
 }
 
 impl Warp for Se3Field {
     fn map(&self, at: &Points, code: &Tensor) -> Tensor {
-        move_points(Dof::Pose, &self.network.apply(code), &at.position)
+        move_points(Dof::Pose, &self.twist(code), &at.position)
     }
     fn code_width(&self) -> usize {
         self.code
@@ -156,7 +162,7 @@ impl Warp for Se3Field {
         self.network.parameters.clone()
     }
     fn global(&self, _: &Axis, code: &Tensor) -> Option<Tensor> {
-        Some(se3_exp(&self.network.apply(code)))
+        Some(se3_exp(&self.twist(code)))
     }
     fn dof(&self) -> Dof {
         Dof::Pose
