@@ -11,10 +11,15 @@ use raygrad_benches::{Table, mean, median, quick, train};
 #[derive(Parser)]
 struct Args {
     /// First and one past the last seed.
-    #[arg(long, default_value = "0..10")]
+    #[arg(long, default_value = "0..10", overrides_with = "seeds")]
     seeds: String,
     /// Presets to compare.
-    #[arg(long, default_value = "planar-l2g-small,planar-barf-small,planar-naive-small", value_delimiter = ',')]
+    #[arg(
+        long,
+        default_value = "planar-l2g-small,planar-barf-small,planar-naive-small",
+        value_delimiter = ',',
+        overrides_with = "presets"
+    )]
     presets: Vec<String>,
     /// Override a setting of all of them.
     #[arg(long = "set", value_name = "KEY=VALUE")]
@@ -72,19 +77,28 @@ fn main() -> anyhow::Result<()> {
         table.row(cells);
     }
     println!("{table}");
-    let mut table =
-        Table::new(&["method", "successes", "median error, px", "mean error, px", "mean PSNR, dB", "mean seconds"]);
+    let mut table = Table::new(&["method", "successes", "median error, px", "error, px", "PSNR, dB", "mean seconds"]);
     for (preset, runs) in args.presets.iter().zip(&runs) {
         let of = |f: fn(&Run) -> f64| runs.iter().map(f).collect::<Vec<_>>();
         table.row([
             preset.clone(),
             format!("{} of {}", runs.iter().filter(|r| r.success).count(), runs.len()),
             format!("{:.2}", median(&of(|r| r.corner))),
-            format!("{:.2}", mean(&of(|r| r.corner))),
-            format!("{:.2}", mean(&of(|r| r.psnr))),
+            with_spread(&of(|r| r.corner)),
+            with_spread(&of(|r| r.psnr)),
             format!("{:.0}", mean(&of(|r| r.seconds))),
         ]);
     }
     println!("{table}");
     Ok(())
+}
+
+/// Mean and standard deviation, with n - 1.
+fn with_spread(values: &[f64]) -> String {
+    let (n, middle) = (values.len() as f64, mean(values));
+    let squares: f64 = values.iter().map(|v| (v - middle).powi(2)).sum();
+    match values.len() {
+        0 | 1 => format!("{middle:.2}"),
+        _ => format!("{middle:.2} +- {:.2}", (squares / (n - 1.0)).sqrt()),
+    }
 }

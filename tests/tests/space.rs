@@ -189,12 +189,13 @@ fn known_and_global_poses() {
 #[test]
 fn local_motions() {
     check_model("l2g-blender", &[]);
-    check_model("l2g-llff", &["radiance.view_dependent=false"]);
+    check_model("l2g-llff", &["radiance.view_dependent=false", "warp.output_scale=[0.25,1.5]"]);
 }
 
 #[test]
 fn invertible_warps() {
-    // With the paper's weight, 1e4, second derivatives are differences of numbers too large for the tolerances.
+    // With the paper's weight, 1e4, second derivatives are differences of numbers too large for the tolerances. All
+    // derivatives are linear in the weight, so what holds at 100 holds there.
     check_model("inn-llff", &["loss.alignment=100.0"]);
     check_model("inn-blender", &["warp.method=multi-invertible"]);
 }
@@ -203,7 +204,7 @@ fn invertible_warps() {
 fn plain_networks() {
     check_model("inn-blender", &["warp.method=mlp"]);
     check_model("inn-blender", &["warp.method=implicit-mlp"]);
-    check_model("inn-blender", &["warp.method=se3-field"]);
+    check_model("inn-blender", &["warp.method=se3-field", "warp.output_scale=[0.5,2.0]"]);
 }
 
 /// Two fields, the second at depths that the first one's weights give.

@@ -13,6 +13,10 @@ pub enum Metric {
     PsnrDb,
     Ssim,
     Lpips,
+    /// The same three where a view has a mask: both pictures on white outside it, over the whole frame.
+    MaskedPsnrDb,
+    MaskedSsim,
+    MaskedLpips,
     /// Mean absolute, in units of the data set.
     DepthError,
     /// In the plane: mean distance between estimated and true corners of the patches.
@@ -27,12 +31,15 @@ pub enum Metric {
 pub const SUCCESS_PX: f64 = 5.0;
 
 impl Metric {
-    pub const ALL: [Metric; 9] = [
+    pub const ALL: [Metric; 12] = [
         Metric::RotationErrorDeg,
         Metric::TranslationErrorX100,
         Metric::PsnrDb,
         Metric::Ssim,
         Metric::Lpips,
+        Metric::MaskedPsnrDb,
+        Metric::MaskedSsim,
+        Metric::MaskedLpips,
         Metric::DepthError,
         Metric::CornerErrorPx,
         Metric::PatchPsnrDb,
@@ -47,6 +54,9 @@ impl Metric {
             Metric::PsnrDb => "psnr_db",
             Metric::Ssim => "ssim",
             Metric::Lpips => "lpips",
+            Metric::MaskedPsnrDb => "masked_psnr_db",
+            Metric::MaskedSsim => "masked_ssim",
+            Metric::MaskedLpips => "masked_lpips",
             Metric::DepthError => "depth_error",
             Metric::CornerErrorPx => "corner_error_px",
             Metric::PatchPsnrDb => "patch_psnr_db",
@@ -62,6 +72,9 @@ impl Metric {
             Metric::PsnrDb => "PSNR (dB)",
             Metric::Ssim => "SSIM",
             Metric::Lpips => "LPIPS",
+            Metric::MaskedPsnrDb => "masked PSNR (dB)",
+            Metric::MaskedSsim => "masked SSIM",
+            Metric::MaskedLpips => "masked LPIPS",
             Metric::DepthError => "depth error",
             Metric::CornerErrorPx => "corner error (px)",
             Metric::PatchPsnrDb => "patch PSNR (dB)",
@@ -72,20 +85,22 @@ impl Metric {
     /// Digits after the point.
     pub fn decimals(self) -> usize {
         match self {
-            Metric::PsnrDb | Metric::PatchPsnrDb | Metric::Success => 2,
+            Metric::PsnrDb | Metric::MaskedPsnrDb | Metric::PatchPsnrDb | Metric::Success => 2,
             _ => 3,
         }
     }
 
     /// Whether a smaller number is a better one.
     pub fn lower_is_better(self) -> bool {
-        !matches!(self, Metric::PsnrDb | Metric::Ssim | Metric::PatchPsnrDb | Metric::Success)
+        use Metric::{MaskedPsnrDb, MaskedSsim, PatchPsnrDb, PsnrDb, Ssim, Success};
+        !matches!(self, PsnrDb | Ssim | MaskedPsnrDb | MaskedSsim | PatchPsnrDb | Success)
     }
 
     /// Whether it is of test views, and so differs before and after refinement of their poses; the others are of the
     /// training cameras or patches.
     pub fn is_of_views(self) -> bool {
-        matches!(self, Metric::PsnrDb | Metric::Ssim | Metric::Lpips | Metric::DepthError)
+        use Metric::{DepthError, Lpips, MaskedLpips, MaskedPsnrDb, MaskedSsim, PsnrDb, Ssim};
+        matches!(self, PsnrDb | Ssim | Lpips | MaskedPsnrDb | MaskedSsim | MaskedLpips | DepthError)
     }
 }
 
@@ -104,6 +119,12 @@ pub struct Scores {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub lpips: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
+    pub masked_psnr_db: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub masked_ssim: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub masked_lpips: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub depth_error: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub corner_error_px: Option<f64>,
@@ -121,6 +142,9 @@ impl Scores {
             Metric::PsnrDb => self.psnr_db,
             Metric::Ssim => self.ssim,
             Metric::Lpips => self.lpips,
+            Metric::MaskedPsnrDb => self.masked_psnr_db,
+            Metric::MaskedSsim => self.masked_ssim,
+            Metric::MaskedLpips => self.masked_lpips,
             Metric::DepthError => self.depth_error,
             Metric::CornerErrorPx => self.corner_error_px,
             Metric::PatchPsnrDb => self.patch_psnr_db,
@@ -140,6 +164,9 @@ impl Scores {
             psnr_db: of(Metric::PsnrDb),
             ssim: of(Metric::Ssim),
             lpips: of(Metric::Lpips),
+            masked_psnr_db: of(Metric::MaskedPsnrDb),
+            masked_ssim: of(Metric::MaskedSsim),
+            masked_lpips: of(Metric::MaskedLpips),
             depth_error: of(Metric::DepthError),
             corner_error_px: of(Metric::CornerErrorPx),
             patch_psnr_db: of(Metric::PatchPsnrDb),
@@ -243,11 +270,12 @@ mod tests {
         }
         let all: Scores = serde_json::from_str(
             r#"{"rotation_error_deg": 1, "translation_error_x100": 2, "psnr_db": 3,
-                "ssim": 4, "lpips": 5, "depth_error": 6, "corner_error_px": 7, "patch_psnr_db": 8, "success": 9}"#,
+                "ssim": 4, "lpips": 5, "masked_psnr_db": 6, "masked_ssim": 7, "masked_lpips": 8, "depth_error": 9,
+                "corner_error_px": 10, "patch_psnr_db": 11, "success": 12}"#,
         )
         .unwrap();
         let values: Vec<f64> = Metric::ALL.iter().filter_map(|m| all.get(*m)).collect();
-        assert_eq!(values, [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0]);
+        assert_eq!(values, (1..=12).map(f64::from).collect::<Vec<_>>());
         let json = serde_json::to_value(all).unwrap();
         assert!(Metric::ALL.iter().all(|m| json.get(m.key()).is_some()));
     }

@@ -71,16 +71,32 @@ pub fn evaluate(
 }
 
 fn scores(seen: &Rendered, view: &View, scale: f64, lpips: Option<&Lpips>) -> Result<Scores, Error> {
-    let (width, height) = (view.intrinsics.width, view.intrinsics.height);
+    let pair = |seen: &[f32], photo: &[f32]| -> Result<(f64, f64, Option<f64>), Error> {
+        let (width, height) = (view.intrinsics.width, view.intrinsics.height);
+        let (a, b) = (Picture::new(width, height, seen)?, Picture::new(width, height, photo)?);
+        Ok((psnr(&a, &b)?, ssim(&a, &b)?, lpips.map(|l| l.distance(&a, &b)).transpose()?))
+    };
     let photo = view.rgb();
-    let (a, b) = (Picture::new(width, height, &seen.rgb)?, Picture::new(width, height, &photo)?);
+    let whole = pair(&seen.rgb, &photo)?;
+    let masked = match &view.mask {
+        Some(mask) => Some(pair(&on_white(&seen.rgb, mask), &on_white(&photo, mask))?),
+        None => None,
+    };
     Ok(Scores {
-        psnr_db: Some(psnr(&a, &b)?),
-        ssim: Some(ssim(&a, &b)?),
-        lpips: lpips.map(|l| l.distance(&a, &b)).transpose()?,
+        psnr_db: Some(whole.0),
+        ssim: Some(whole.1),
+        lpips: whole.2,
+        masked_psnr_db: masked.map(|m| m.0),
+        masked_ssim: masked.map(|m| m.1),
+        masked_lpips: masked.and_then(|m| m.2),
         depth_error: depth_error(seen, view, scale)?,
         ..Scores::default()
     })
+}
+
+/// White where the mask of a picture says background.
+fn on_white(rgb: &[f32], mask: &[bool]) -> Vec<f32> {
+    rgb.chunks(3).zip(mask).flat_map(|(c, m)| if *m { [c[0], c[1], c[2]] } else { [1.0; 3] }).collect()
 }
 
 /// Mean absolute error of the composited depth in true units, where the view has a depth.
@@ -90,5 +106,41 @@ fn depth_error(seen: &Rendered, view: &View, scale: f64) -> Result<Option<f64>, 
     match valid.contains(&true) {
         true => Ok(Some(depth_errors(&seen.depth, truth, &valid, scale)?.abs)),
         false => Ok(None),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::Intrinsics;
+
+    #[test]
+    fn what_lies_outside_a_mask_counts_in_the_whole_picture_alone() {
+        let (height, width) = (12, 16);
+        let n = height * width;
+        let intrinsics = Intrinsics { fx: 1.0, fy: 1.0, cx: 8.0, cy: 6.0, height, width, distortion: None };
+        let inside = |i: usize| i % width < 4;
+        let mask = Some((0..n).map(inside).collect());
+        let mut view = View {
+            name: "v".into(),
+            pixels: vec![[51, 102, 204, 255]; n],
+            transparent: false,
+            intrinsics,
+            pose: None,
+            mask,
+            depth: None,
+        };
+        // Off by 0.1 on the object, by 0.2 around it.
+        let rgb: Vec<f32> =
+            (0..n).flat_map(|i| [0.2, 0.4, 0.8].map(|c| c - if inside(i) { 0.1 } else { 0.2 })).collect();
+        let seen = Rendered { rgb, depth: vec![1.0; n], opacity: vec![1.0; n] };
+        let found = scores(&seen, &view, 1.0, None).unwrap();
+        let near = |found: Option<f64>, mse: f64| (found.unwrap() + 10.0 * mse.log10()).abs() < 1e-4;
+        assert!(near(found.psnr_db, 0.25 * 0.01 + 0.75 * 0.04), "{found:?}");
+        assert!(near(found.masked_psnr_db, 0.25 * 0.01), "{found:?}");
+        assert!(found.masked_ssim > found.ssim && found.masked_lpips.is_none());
+        view.mask = None;
+        let found = scores(&seen, &view, 1.0, None).unwrap();
+        assert_eq!((found.masked_psnr_db, found.masked_ssim), (None, None));
     }
 }

@@ -133,7 +133,9 @@ impl RunFolder {
         }
         std::fs::create_dir_all(&self.path)
             .map_err(|source| FolderError::Access { path: self.path.clone(), source })?;
-        let text = toml::to_string(settings).unwrap_or_default();
+        // A setting that later versions add is then what that preset says: as it was before.
+        let base = if settings.scene.is_some() { "l2g-blender" } else { "planar-l2g" };
+        let text = format!("base = \"{base}\"\n\n{}", toml::to_string(settings).unwrap_or_default());
         Ok(self.write(CONFIG, text.as_bytes())?)
     }
 
@@ -221,6 +223,11 @@ mod tests {
         let text = error(RunFolder::claim(&path, &other));
         assert!(text.contains("there `optim.steps` is 5000, here 7"), "{text}");
         assert!(RunFolder::reopen(&path, &settings).is_ok());
+        let text = std::fs::read_to_string(path.join(CONFIG)).unwrap();
+        let older: Vec<&str> = text.lines().filter(|l| !l.starts_with("warmup_pose")).collect();
+        assert!(older.len() < text.lines().count());
+        std::fs::write(path.join(CONFIG), older.join("\n")).unwrap();
+        assert!(RunFolder::reopen(&path, &settings).is_ok(), "a setting of later versions");
         assert!(error(RunFolder::reopen(&path, &other)).contains("optim.steps"));
         std::fs::remove_file(path.join(CONFIG)).unwrap();
         std::fs::write(path.join("thesis.tex"), "x").unwrap();

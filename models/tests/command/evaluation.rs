@@ -86,6 +86,12 @@ fn lpips_is_measured_where_weights_are_given() {
     assert_eq!(again["after"], trained["after"]);
     let without: Value = serde_json::from_str(&w.succeed(&["eval", "run", "--json"])).unwrap();
     assert!(without["after"]["mean"]["lpips"].is_null());
+    // A sweep measures finished runs that lack it.
+    let grid = "presets = [\"space.toml\"]\nset.optim.steps = 1\nset.scene.image_size = [32, 32]\n";
+    std::fs::write(w.path("grid.toml"), grid).unwrap();
+    assert!(!w.succeed(&["sweep", "grid.toml"]).contains("LPIPS"));
+    let table = w.succeed(&["sweep", "grid.toml", "--lpips", "weights.safetensors"]);
+    mentions(&table, &["LPIPS, before", "LPIPS, after"]);
     w.succeed(&["train", "tiny.toml", "--out", "planar", "--steps", "1"]);
     let planar = ["eval", "planar", "--lpips", "weights.safetensors"];
     mentions(&w.refuse(&planar), &["--lpips", "this one is in the plane"]);

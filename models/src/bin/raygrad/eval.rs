@@ -100,7 +100,8 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn measure(model: &mut dyn Training, folder: &RunFolder) -> Result<Evaluation, Error> {
+/// Measures a model and writes what it finds into its run's folder, with a bar over the views.
+pub fn measure(model: &mut dyn Training, folder: &RunFolder) -> Result<Evaluation, Error> {
     let shown = bar("evaluating", "views");
     let evaluation = model.write_evaluation(folder, &|done, all| shown.show(done, all));
     shown.finish();

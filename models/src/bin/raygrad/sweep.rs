@@ -1,13 +1,14 @@
 //! `raygrad sweep`: runs of one file, and the papers' tables of them.
 
+use crate::eval::measure;
 use crate::progress::Progress as Shown;
 use crate::{listen, output_folder, print};
 use anyhow::bail;
 use clap::Args;
 use raygrad::config::{Sweep, SweepCell};
 use raygrad::evaluation::{Evaluation, Lpips};
-use raygrad::run::FolderError;
 use raygrad::run::files::write_atomically;
+use raygrad::run::{FolderError, RunFolder};
 use raygrad::sweep::{Progress, results};
 use raygrad::{Error, Experiment};
 use std::path::{Path, PathBuf};
@@ -82,7 +83,13 @@ fn train(
     stop: &AtomicBool,
 ) -> Result<Option<Evaluation>, Error> {
     let begun = match state {
-        Progress::Done(evaluation) => return Ok(Some(*evaluation)),
+        Progress::Done(evaluation) => {
+            let lacks = evaluation.before.as_ref().is_some_and(|b| b.mean.lpips.is_none());
+            return match lpips.filter(|_| lacks) {
+                Some(weights) => measured_again(&cell.folder(folder), weights).map(Some),
+                None => Ok(Some(*evaluation)),
+            };
+        }
         Progress::Begun => true,
         Progress::Open => {
             cell.clear(folder)?;
@@ -100,4 +107,10 @@ fn train(
         Progress::Done(evaluation) => Ok(Some(*evaluation)),
         _ => Ok(None),
     }
+}
+
+/// A finished run with LPIPS, which it was trained without.
+fn measured_again(run: &Path, weights: &Path) -> Result<Evaluation, Error> {
+    let mut explorer = Experiment::of_run(run)?.lpips(weights)?.restored_explorer()?;
+    measure(&mut explorer, &RunFolder::open(run)?)
 }
