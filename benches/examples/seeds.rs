@@ -6,6 +6,7 @@
 use anyhow::{Context, ensure};
 use clap::Parser;
 use raygrad::Experiment;
+use raygrad::evaluation::Cell;
 use raygrad_benches::{Table, mean, median, quick, train};
 
 #[derive(Parser)]
@@ -93,12 +94,11 @@ fn main() -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Mean and standard deviation, with n - 1.
+/// Mean and standard deviation.
 fn with_spread(values: &[f64]) -> String {
-    let (n, middle) = (values.len() as f64, mean(values));
-    let squares: f64 = values.iter().map(|v| (v - middle).powi(2)).sum();
-    match values.len() {
-        0 | 1 => format!("{middle:.2}"),
-        _ => format!("{middle:.2} +- {:.2}", (squares / (n - 1.0)).sqrt()),
+    match Cell::of(values) {
+        Some(Cell { mean, spread: Some(spread) }) => format!("{mean:.2} +- {spread:.2}"),
+        Some(Cell { mean, spread: None }) => format!("{mean:.2}"),
+        None => String::new(),
     }
 }

@@ -24,7 +24,7 @@ pub struct Cell {
 
 impl Cell {
     /// Of several runs; nothing of none.
-    fn of(values: &[f64]) -> Option<Cell> {
+    pub fn of(values: &[f64]) -> Option<Cell> {
         let n = values.len() as f64;
         let mean = values.iter().sum::<f64>() / n;
         let squares = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>();
