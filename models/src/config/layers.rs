@@ -1,8 +1,12 @@
 //! Layers of settings: a file, the `base` below it, assignments above it, each value with its origin.
+//!
+//! A file may have a section `captures`: what it sets instead where the scene is a capture ([`Layout::is_capture`]), as in
+//! `optim.lr = 1e-3` below `[captures]`. Whatever is set later, in a file or by an assignment, wins over both.
 
 use super::error::{ConfigError, Origin};
 use super::presets::{PRESETS, Preset};
 use super::settings::Settings;
+use crate::scene::Layout;
 use std::collections::BTreeMap;
 use std::path::Path;
 use toml::de::{DeTable, DeValue};
@@ -16,7 +20,15 @@ pub struct Layered {
     pub settings: Settings,
     table: Table,
     origins: BTreeMap<String, Origin>,
+    /// The section `captures`; once the scene is a capture, what is set where it is not.
+    other: BTreeMap<String, (Value, Origin)>,
+    on_capture: bool,
 }
+
+/// Before the keys of the section.
+const CAPTURES: &str = "captures.";
+/// The key of the scene's folder.
+const SCENE: &str = "scene.path";
 
 impl Layered {
     /// Loads a preset by name, or a file if `name` ends in `.toml`.
@@ -66,6 +78,11 @@ impl Layered {
         ConfigError::Value { origin: self.origin(key), key: key.to_string(), message: message.into() }
     }
 
+    /// Whether settings for captures are in force.
+    pub fn is_on_capture(&self) -> bool {
+        self.on_capture
+    }
+
     /// Sets a value that a file sets.
     pub(super) fn apply(&mut self, key: &str, value: Value, origin: Origin) -> Result<(), ConfigError> {
         if !self.has(key) {
@@ -74,24 +91,60 @@ impl Layered {
         self.put(key, value, origin)
     }
 
+    /// Sets everything that a file sets.
+    fn apply_all(&mut self, leaves: Vec<Leaf>) -> Result<(), ConfigError> {
+        let (captures, plain): (Vec<Leaf>, Vec<Leaf>) = leaves.into_iter().partition(|l| l.key.starts_with(CAPTURES));
+        for leaf in plain {
+            self.apply(&leaf.key, leaf.value, leaf.origin)?;
+        }
+        for Leaf { key, value, origin } in captures {
+            let key = &key[CAPTURES.len()..];
+            // In force or not, it must fit.
+            let mut set = self.clone();
+            set.apply(key, value.clone(), origin.clone())?;
+            let other = if self.on_capture { self.replace(key, value, origin)? } else { (value, origin) };
+            self.other.insert(key.to_string(), other);
+        }
+        Ok(())
+    }
+
     fn has(&self, key: &str) -> bool {
         self.origins.contains_key(key)
     }
 
-    /// Replaces one value, keeping the old one if the new one has the wrong type.
+    /// Sets one value, for captures and all other scenes; the old one stays if it has the wrong type.
     fn put(&mut self, key: &str, value: Value, origin: Origin) -> Result<(), ConfigError> {
-        let mut table = self.table.clone();
-        if let Some(slot) = slot(&mut table, key) {
-            *slot = value;
+        self.replace(key, value, origin)?;
+        self.other.remove(key);
+        if key == SCENE { self.suit_scene() } else { Ok(()) }
+    }
+
+    /// Exchanges the values that captures have for themselves where the scene has become one, or ceased to be one.
+    fn suit_scene(&mut self) -> Result<(), ConfigError> {
+        let path = self.settings.scene.as_ref().map_or("", |s| &s.path);
+        let is_capture = Layout::of(Path::new(path)).is_ok_and(Layout::is_capture);
+        if is_capture != self.on_capture {
+            self.on_capture = is_capture;
+            for (key, (value, origin)) in std::mem::take(&mut self.other) {
+                let old = self.replace(&key, value, origin)?;
+                self.other.insert(key, old);
+            }
         }
+        Ok(())
+    }
+
+    /// Replaces one value and returns the old one, which stays if the new one has the wrong type.
+    fn replace(&mut self, key: &str, value: Value, origin: Origin) -> Result<(Value, Origin), ConfigError> {
+        let mut table = self.table.clone();
+        let old = slot(&mut table, key).map_or(Value::Boolean(false), |slot| std::mem::replace(slot, value));
         self.settings = parse(&table).map_err(|(field, message)| ConfigError::Value {
             origin: origin.clone(),
             key: if field.is_empty() { key.to_string() } else { field },
             message,
         })?;
         self.table = table;
-        self.origins.insert(key.to_string(), origin);
-        Ok(())
+        let from = self.origins.insert(key.to_string(), origin.clone()).unwrap_or(origin);
+        Ok((old, from))
     }
 }
 
@@ -124,9 +177,7 @@ fn load(name: &str, below: &mut Vec<String>) -> Result<Layered, ConfigError> {
                 return Err(ConfigError::Cycle { origin: base.origin, name: base_name.clone() });
             }
             let mut layered = load(base_name, below)?;
-            for leaf in leaves {
-                layered.apply(&leaf.key, leaf.value, leaf.origin)?;
-            }
+            layered.apply_all(leaves)?;
             layered.name = label;
             Ok(layered)
         }
@@ -135,6 +186,7 @@ fn load(name: &str, below: &mut Vec<String>) -> Result<Layered, ConfigError> {
 
 /// A file without a base: it must set everything.
 fn root(name: String, file: String, leaves: Vec<Leaf>) -> Result<Layered, ConfigError> {
+    let (captures, leaves): (Vec<Leaf>, Vec<Leaf>) = leaves.into_iter().partition(|l| l.key.starts_with(CAPTURES));
     let known: Vec<String> = known_keys(leaves.iter().any(|l| l.key.starts_with("scene.")));
     let (mut table, mut origins) = (Table::new(), BTreeMap::new());
     for leaf in leaves {
@@ -151,7 +203,10 @@ fn root(name: String, file: String, leaves: Vec<Leaf>) -> Result<Layered, Config
         let origin = origins.iter().find(|(k, _)| key.starts_with(*k)).map(|(_, o)| o.clone());
         ConfigError::Value { origin: origin.unwrap_or(Origin::Line { file, line: 1 }), key, message }
     })?;
-    Ok(Layered { name, settings, table, origins })
+    let mut layered = Layered { name, settings, table, origins, other: BTreeMap::new(), on_capture: false };
+    layered.suit_scene()?;
+    layered.apply_all(captures)?;
+    Ok(layered)
 }
 
 /// The keys of the preset that sets them all, in 3D or 2D.
@@ -330,5 +385,47 @@ mod tests {
         assert!(error("[data]\npatches = 5\n").contains("missing `data.image`"));
         let mine = write("base = \"planar-barf\"\n[optim]\nsteps = 7\n").unwrap();
         assert_eq!((mine.settings.optim.steps, mine.name.as_str()), (7, "mine"));
+    }
+
+    #[test]
+    fn captures_have_values_of_their_own_until_others_are_set() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
+        std::fs::create_dir(path("photos")).unwrap();
+        for i in 0..3 {
+            image::RgbImage::new(4, 4).save(dir.path().join("photos").join(format!("{i}.png"))).unwrap();
+        }
+        let file = path("mine.toml");
+        let text = "base = \"l2g-small\"\n[captures]\noptim.steps = 7\noptim.lr = 0.25\n[optim]\nsteps = 9\nlr = 0.5\n";
+        std::fs::write(&file, text).unwrap();
+        let mut l = Layered::load(&file).unwrap();
+        let numbers = |l: &Layered| (l.settings.optim.steps, l.settings.optim.lr);
+        let scene = |l: &mut Layered, path: &str| l.set(&format!("scene.path={path}")).unwrap();
+        assert_eq!((numbers(&l), l.is_on_capture()), ((9, 0.5), false));
+        scene(&mut l, &path("photos"));
+        assert_eq!((numbers(&l), l.is_on_capture()), ((7, 0.25), true));
+        assert_eq!(l.origin("optim.lr"), Origin::Line { file: file.clone(), line: 4 });
+        scene(&mut l, "builtin");
+        assert_eq!(numbers(&l), (9, 0.5));
+        assert_eq!(l.origin("optim.lr"), Origin::Line { file: file.clone(), line: 7 });
+        l.set("optim.lr=0.125").unwrap();
+        scene(&mut l, &path("photos"));
+        assert_eq!(numbers(&l), (7, 0.125));
+        l.set("optim.steps=8").unwrap();
+        scene(&mut l, "builtin");
+        assert_eq!(numbers(&l), (8, 0.125));
+        // A file above the section wins over it too, whether it names the scene or not.
+        let above = path("above.toml");
+        let text = format!("base = {file:?}\n[optim]\nlr = 0.75\n[scene]\npath = {:?}\n", path("photos"));
+        std::fs::write(&above, text).unwrap();
+        assert_eq!(numbers(&Layered::load(&above).unwrap()), (7, 0.75));
+        for (line, expected) in [
+            ("optim.stesp = 1", "did you mean `optim.steps`?"),
+            ("optim.steps = \"many\"", "mine.toml:3: `optim.steps`: invalid type"),
+        ] {
+            std::fs::write(&file, format!("base = \"l2g-small\"\n[captures]\n{line}\n")).unwrap();
+            let error = Layered::load(&file).unwrap_err().to_string();
+            assert!(error.contains(expected), "{error}");
+        }
     }
 }

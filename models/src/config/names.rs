@@ -58,10 +58,10 @@ impl Settings {
 impl SceneSettings {
     /// `poses`, with "auto" replaced by what it means for a scene of this layout: the identity for captures.
     pub fn poses_in(&self, layout: Layout) -> &str {
-        match (self.poses.as_str(), layout) {
-            ("auto", Layout::Blender | Layout::Dtu) => "noisy",
-            ("auto", _) => "identity",
-            (other, _) => other,
+        match self.poses.as_str() {
+            "auto" if layout.is_capture() => "identity",
+            "auto" => "noisy",
+            other => other,
         }
     }
 }

@@ -137,6 +137,11 @@ impl Layout {
         }
     }
 
+    /// Whether it is of photos that somebody took, whose poses, if there are any, are a reconstruction program's.
+    pub fn is_capture(self) -> bool {
+        !matches!(self, Layout::Blender | Layout::Dtu)
+    }
+
     /// The layout called `name`.
     pub fn from_name(name: &str) -> Option<Layout> {
         Layout::ALL.into_iter().find(|l| l.name() == name)

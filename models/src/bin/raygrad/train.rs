@@ -39,6 +39,10 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     if let Some(out) = &args.out {
         experiment = experiment.out(out);
     }
+    let layered = &experiment.layered;
+    if layered.is_on_capture() {
+        eprintln!("{} is a capture: {} has settings of its own for those", layered.settings.scene_name(), layered.name);
+    }
     let stop = listen()?;
     let outcome = experiment.train_observed(&mut Progress::new(), &stop)?;
     Ok(tell(&outcome))
