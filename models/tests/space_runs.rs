@@ -81,6 +81,16 @@ fn an_interrupted_run_resumes_bit_by_bit_with_every_method() {
 }
 
 #[test]
+fn a_finished_run_that_is_resumed_keeps_its_numbers() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = dir.path().join("run");
+    let last = |resume| tiny(&[], &run).resume(resume).train().unwrap().metrics.last.unwrap().entry;
+    let first = last(false);
+    assert!(first.loss["render"] > 0.0);
+    assert_eq!(last(true), first);
+}
+
+#[test]
 fn a_run_leaves_poses_views_and_scores() {
     let dir = tempfile::tempdir().unwrap();
     let run = dir.path().join("run");

@@ -236,7 +236,8 @@ impl Training for Explorer {
         metrics: &mut Metrics,
         seconds: &dyn Fn() -> f64,
     ) -> Result<(), Error> {
-        let entry = self.measure()?;
+        // Of a finished run that is resumed no step was taken that could be measured.
+        let entry = metrics.steps.last().cloned().map_or_else(|| self.measure(), Ok)?;
         metrics.last = Some(Final { entry, seconds: seconds(), warps: vec![] });
         let written = results::write_evaluation(folder, self, &|_, _| {})?;
         results::write_report(folder, layered, self, metrics, &written)?;
