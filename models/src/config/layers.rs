@@ -1,12 +1,11 @@
 //! Layers of settings: a file, the `base` below it, assignments above it, each value with its origin.
 //!
-//! A file may have a section `captures`: what it sets instead where the scene is a capture ([`Layout::is_capture`]), as in
+//! A file may have a section `captures`: what it sets instead where the scene is a capture ([`crate::scene::Layout::is_capture`]), as in
 //! `optim.lr = 1e-3` below `[captures]`. Whatever is set later, in a file or by an assignment, wins over both.
 
 use super::error::{ConfigError, Origin};
 use super::presets::{PRESETS, Preset};
 use super::settings::Settings;
-use crate::scene::Layout;
 use std::collections::BTreeMap;
 use std::path::Path;
 use toml::de::{DeTable, DeValue};
@@ -49,9 +48,7 @@ impl Layered {
 
     /// Sets one value, given as it would be written in a file or as a bare word.
     pub fn assign(&mut self, key: &str, raw: &str, origin: Origin) -> Result<(), ConfigError> {
-        if !self.has(key) {
-            return Err(unknown(origin, key, self.origins.keys()));
-        }
+        self.check_key(key, &origin)?;
         let word = Value::String(raw.to_string());
         let parsed =
             format!("v = {raw}").parse::<Table>().ok().filter(|t| t.len() == 1).and_then(|mut t| t.remove("v"));
@@ -78,38 +75,33 @@ impl Layered {
         ConfigError::Value { origin: self.origin(key), key: key.to_string(), message: message.into() }
     }
 
-    /// Whether settings for captures are in force.
+    /// Whether the scene is a capture and something is set for those.
     pub fn is_on_capture(&self) -> bool {
-        self.on_capture
+        self.on_capture && !self.other.is_empty()
     }
 
     /// Sets a value that a file sets.
     pub(super) fn apply(&mut self, key: &str, value: Value, origin: Origin) -> Result<(), ConfigError> {
-        if !self.has(key) {
-            return Err(unknown(origin, key, self.origins.keys()));
-        }
+        self.check_key(key, &origin)?;
         self.put(key, value, origin)
     }
 
-    /// Sets everything that a file sets.
-    fn apply_all(&mut self, leaves: Vec<Leaf>) -> Result<(), ConfigError> {
-        let (captures, plain): (Vec<Leaf>, Vec<Leaf>) = leaves.into_iter().partition(|l| l.key.starts_with(CAPTURES));
-        for leaf in plain {
-            self.apply(&leaf.key, leaf.value, leaf.origin)?;
+    /// Sets a value that a file sets for captures. In force or not, it must fit.
+    fn apply_to_captures(&mut self, key: &str, value: Value, origin: Origin) -> Result<(), ConfigError> {
+        self.check_key(key, &origin)?;
+        let mut other = self.replace(key, value, origin)?;
+        if !self.on_capture {
+            other = self.replace(key, other.0, other.1)?;
         }
-        for Leaf { key, value, origin } in captures {
-            let key = &key[CAPTURES.len()..];
-            // In force or not, it must fit.
-            let mut set = self.clone();
-            set.apply(key, value.clone(), origin.clone())?;
-            let other = if self.on_capture { self.replace(key, value, origin)? } else { (value, origin) };
-            self.other.insert(key.to_string(), other);
-        }
+        self.other.insert(key.to_string(), other);
         Ok(())
     }
 
-    fn has(&self, key: &str) -> bool {
-        self.origins.contains_key(key)
+    fn check_key(&self, key: &str, origin: &Origin) -> Result<(), ConfigError> {
+        if self.origins.contains_key(key) {
+            return Ok(());
+        }
+        Err(unknown(origin.clone(), key, self.origins.keys()))
     }
 
     /// Sets one value, for captures and all other scenes; the old one stays if it has the wrong type.
@@ -121,8 +113,7 @@ impl Layered {
 
     /// Exchanges the values that captures have for themselves where the scene has become one, or ceased to be one.
     fn suit_scene(&mut self) -> Result<(), ConfigError> {
-        let path = self.settings.scene.as_ref().map_or("", |s| &s.path);
-        let is_capture = Layout::of(Path::new(path)).is_ok_and(Layout::is_capture);
+        let is_capture = self.settings.scene.as_ref().is_some_and(|s| s.layout().is_capture());
         if is_capture != self.on_capture {
             self.on_capture = is_capture;
             for (key, (value, origin)) in std::mem::take(&mut self.other) {
@@ -163,11 +154,12 @@ fn load(name: &str, below: &mut Vec<String>) -> Result<Layered, ConfigError> {
             return Err(ConfigError::UnknownPreset { name: name.to_string(), nearest });
         }
     };
-    let mut leaves = leaves(&file, &text)?;
+    let (captures, mut leaves): (Vec<Leaf>, Vec<Leaf>) =
+        leaves(&file, &text)?.into_iter().partition(|l| l.key.starts_with(CAPTURES));
     let base = leaves.iter().position(|l| l.key == "base").map(|i| leaves.remove(i));
     below.push(name.to_string());
-    match base {
-        None => root(label, file, leaves),
+    let mut layered = match base {
+        None => root(label, file, leaves)?,
         Some(base) => {
             let Value::String(base_name) = &base.value else {
                 let message = "expected the name of a preset or a file".to_string();
@@ -177,16 +169,20 @@ fn load(name: &str, below: &mut Vec<String>) -> Result<Layered, ConfigError> {
                 return Err(ConfigError::Cycle { origin: base.origin, name: base_name.clone() });
             }
             let mut layered = load(base_name, below)?;
-            layered.apply_all(leaves)?;
-            layered.name = label;
-            Ok(layered)
+            for leaf in leaves {
+                layered.apply(&leaf.key, leaf.value, leaf.origin)?;
+            }
+            Layered { name: label, ..layered }
         }
+    };
+    for leaf in captures {
+        layered.apply_to_captures(&leaf.key[CAPTURES.len()..], leaf.value, leaf.origin)?;
     }
+    Ok(layered)
 }
 
 /// A file without a base: it must set everything.
 fn root(name: String, file: String, leaves: Vec<Leaf>) -> Result<Layered, ConfigError> {
-    let (captures, leaves): (Vec<Leaf>, Vec<Leaf>) = leaves.into_iter().partition(|l| l.key.starts_with(CAPTURES));
     let known: Vec<String> = known_keys(leaves.iter().any(|l| l.key.starts_with("scene.")));
     let (mut table, mut origins) = (Table::new(), BTreeMap::new());
     for leaf in leaves {
@@ -205,7 +201,6 @@ fn root(name: String, file: String, leaves: Vec<Leaf>) -> Result<Layered, Config
     })?;
     let mut layered = Layered { name, settings, table, origins, other: BTreeMap::new(), on_capture: false };
     layered.suit_scene()?;
-    layered.apply_all(captures)?;
     Ok(layered)
 }
 
@@ -414,6 +409,10 @@ mod tests {
         l.set("optim.steps=8").unwrap();
         scene(&mut l, "builtin");
         assert_eq!(numbers(&l), (8, 0.125));
+        // A preset without the section has nothing for captures.
+        let mut plain = Layered::load("l2g-llff").unwrap();
+        scene(&mut plain, &path("photos"));
+        assert!(!plain.is_on_capture());
         // A file above the section wins over it too, whether it names the scene or not.
         let above = path("above.toml");
         let text = format!("base = {file:?}\n[optim]\nlr = 0.75\n[scene]\npath = {:?}\n", path("photos"));

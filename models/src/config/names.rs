@@ -38,11 +38,7 @@ impl Settings {
     /// Where poses or patches started, as `published.toml` has it; nothing where the true ones are known.
     pub fn start_name(&self) -> Option<String> {
         let noise = &self.noise;
-        let of_scene = self.scene.as_ref().map(|s| {
-            // The built-in scene, and what cannot be read, is as good as a synthetic one.
-            let layout = Layout::of(Path::new(&s.path)).unwrap_or(Layout::Blender);
-            (s.poses_in(layout), noise.kind)
-        });
+        let of_scene = self.scene.as_ref().map(|s| (s.poses_in(s.layout()), noise.kind));
         match of_scene {
             _ if self.warp.method == Method::None => None,
             None => Some(format!("homography {}, translation {}", noise.homography, noise.translation)),
@@ -56,6 +52,14 @@ impl Settings {
 }
 
 impl SceneSettings {
+    /// The layout of the scene. The built-in one, and what cannot be read, is as good as a synthetic one.
+    pub fn layout(&self) -> Layout {
+        match self.path.as_str() {
+            "builtin" => Layout::Blender,
+            path => Layout::of(Path::new(path)).unwrap_or(Layout::Blender),
+        }
+    }
+
     /// `poses`, with "auto" replaced by what it means for a scene of this layout: the identity for captures.
     pub fn poses_in(&self, layout: Layout) -> &str {
         match self.poses.as_str() {
