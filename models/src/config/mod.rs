@@ -5,6 +5,7 @@
 
 mod error;
 mod layers;
+mod leaves;
 mod names;
 mod presets;
 mod settings;

@@ -12,7 +12,8 @@
 //! ```
 
 use super::error::{ConfigError, Origin};
-use super::layers::{Layered, Leaf, leaves, nearest, unknown};
+use super::layers::{Layered, nearest, unknown};
+use super::leaves::{Leaf, leaves};
 use crate::scene::Layout;
 use std::path::Path;
 use toml::Value;
