@@ -361,5 +361,6 @@ pub fn open_device(choice: DeviceChoice, threads: Option<usize>) -> Result<Devic
         DeviceChoice::Auto => Device::auto(threads),
         DeviceChoice::Cpu => Device::cpu(threads),
         DeviceChoice::Wgpu(index) => Device::wgpu(index),
+        DeviceChoice::Vulkan(index) => Device::vulkan(index),
     }
 }

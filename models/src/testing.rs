@@ -29,7 +29,7 @@ pub enum TestError {
     Evaluate(#[from] EvalError),
     #[error(transparent)]
     Compile(#[from] StepError),
-    #[cfg(feature = "wgpu")]
+    #[cfg(feature = "gpu")]
     #[error(transparent)]
     Lower(#[from] raygrad_kernels::gpu::LowerError),
     #[error(transparent)]
@@ -225,22 +225,23 @@ pub fn kernels(warp: &dyn Warp) -> Result<String, TestError> {
     Ok(format!("cpu\n{cpu}\ngpu\n{gpu}\n{}", wgsl(&gpu)?))
 }
 
-#[cfg(feature = "wgpu")]
+#[cfg(feature = "gpu")]
 fn wgsl(program: &Program) -> Result<String, TestError> {
     use raygrad_kernels::gpu::{Inputs, Limits, lower};
     let lowered = lower(program, &mut Inputs::default(), &Limits::default())?;
     let sources = lowered.launches.iter().flat_map(|l| &l.kernels);
     sources.map(|k| Ok(format!("// {}\n{}", k.name, k.wgsl()?))).collect()
 }
-#[cfg(not(feature = "wgpu"))]
+#[cfg(not(feature = "gpu"))]
 fn wgsl(_: &Program) -> Result<String, TestError> {
     Ok(String::new())
 }
 
-/// The CPU, and an adapter if there is one.
+/// The CPU, and the best adapter of each backend for GPUs, if there is one.
 pub fn devices() -> Result<Vec<(String, Device)>, DeviceError> {
     let mut devices = vec![("cpu".to_string(), Device::cpu(Some(1))?)];
     devices.extend(Device::wgpu(None).ok().map(|d| ("wgpu".to_string(), d)));
+    devices.extend(Device::vulkan(None).ok().map(|d| ("vulkan".to_string(), d)));
     Ok(devices)
 }
 

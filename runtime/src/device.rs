@@ -13,6 +13,9 @@ pub enum Device {
     /// A GPU, or software that acts as one.
     #[cfg(feature = "wgpu")]
     Wgpu { gpu: Arc<crate::wgpu::Gpu> },
+    /// The same through Vulkan, with a device of raygrad's own.
+    #[cfg(feature = "vulkan")]
+    Vulkan { gpu: Arc<crate::vulkan::Gpu> },
 }
 
 /// A device as listed for people.
@@ -28,9 +31,16 @@ pub struct DeviceInfo {
 impl Device {
     /// A real GPU if there is one, else the CPU.
     pub fn auto(threads: Option<usize>) -> Result<Device, DeviceError> {
-        #[cfg(feature = "wgpu")]
-        if let Some(gpu) = crate::wgpu::Gpu::auto() {
-            return Ok(Device::Wgpu { gpu: Arc::new(gpu) });
+        #[cfg(feature = "gpu")]
+        if may_have_gpu() {
+            #[cfg(feature = "wgpu")]
+            if let Some(gpu) = crate::wgpu::Gpu::auto() {
+                return Ok(Device::Wgpu { gpu: Arc::new(gpu) });
+            }
+            #[cfg(feature = "vulkan")]
+            if let Some(gpu) = crate::vulkan::Gpu::auto() {
+                return Ok(Device::Vulkan { gpu: Arc::new(gpu) });
+            }
         }
         Device::cpu(threads)
     }
@@ -41,10 +51,22 @@ impl Device {
         Ok(Device::Wgpu { gpu: Arc::new(crate::wgpu::Gpu::open(index)?) })
     }
 
-    /// This build has no GPU backend.
+    /// This build has no wgpu backend.
     #[cfg(not(feature = "wgpu"))]
     pub fn wgpu(_: Option<usize>) -> Result<Device, DeviceError> {
-        Err(DeviceError::NotBuilt)
+        Err(DeviceError::NotBuilt("wgpu"))
+    }
+
+    /// The Vulkan driver numbered `index` in [`Device::list`], or the best one, software included.
+    #[cfg(feature = "vulkan")]
+    pub fn vulkan(index: Option<usize>) -> Result<Device, DeviceError> {
+        Ok(Device::Vulkan { gpu: Arc::new(crate::vulkan::Gpu::open(index)?) })
+    }
+
+    /// This build has no Vulkan backend.
+    #[cfg(not(feature = "vulkan"))]
+    pub fn vulkan(_: Option<usize>) -> Result<Device, DeviceError> {
+        Err(DeviceError::NotBuilt("vulkan"))
     }
 
     /// The CPU with `threads` threads, by default one a core. Results do not depend on the number.
@@ -65,6 +87,19 @@ impl Device {
             Device::Cpu { .. } => Target::cpu(),
             #[cfg(feature = "wgpu")]
             Device::Wgpu { .. } => Target::gpu(),
+            #[cfg(feature = "vulkan")]
+            Device::Vulkan { .. } => Target::gpu(),
+        }
+    }
+
+    /// The device, for people.
+    pub fn name(&self) -> String {
+        match self {
+            Device::Cpu { pool } => format!("CPU, {} threads", pool.current_num_threads()),
+            #[cfg(feature = "wgpu")]
+            Device::Wgpu { gpu } => gpu.adapter().name.clone(),
+            #[cfg(feature = "vulkan")]
+            Device::Vulkan { gpu } => gpu.adapter().name.clone(),
         }
     }
 
@@ -77,15 +112,31 @@ impl Device {
             backend: "cpu",
             details: format!("{} kernels", Isa::detect()),
         };
-        #[cfg_attr(not(feature = "wgpu"), expect(unused_mut))]
+        #[cfg_attr(not(feature = "gpu"), expect(unused_mut))]
         let mut all = vec![cpu];
         #[cfg(feature = "wgpu")]
-        all.extend(crate::wgpu::Gpu::list().into_iter().enumerate().map(|(i, a)| DeviceInfo {
-            id: format!("wgpu:{i}"),
-            name: a.name,
-            backend: a.backend,
-            details: format!("{}, {}", a.device_type, a.driver),
-        }));
+        all.extend(listed("wgpu", crate::wgpu::Gpu::list()));
+        #[cfg(feature = "vulkan")]
+        all.extend(listed("vulkan", crate::vulkan::Gpu::list()));
         all
     }
+}
+
+/// Adapters of a backend, in the order in which `--device` counts them.
+#[cfg(feature = "gpu")]
+fn listed(backend: &str, adapters: Vec<crate::gpu::Adapter>) -> impl Iterator<Item = DeviceInfo> {
+    adapters.into_iter().enumerate().map(move |(i, a)| DeviceInfo {
+        id: format!("{backend}:{i}"),
+        name: a.name,
+        backend: a.api,
+        details: format!("{}, {}", a.kind, a.driver),
+    })
+}
+
+/// Whether a GPU can be here. Without a device file of one, every adapter is a software one, and to ask it costs 50 MB and
+/// a tenth of a second.
+#[cfg(feature = "gpu")]
+fn may_have_gpu() -> bool {
+    let files = ["/dev/dri", "/dev/nvidiactl", "/dev/dxg", "/dev/kgsl-3d0", "/dev/mali0"];
+    !cfg!(target_os = "linux") || files.iter().any(|f| std::path::Path::new(f).exists())
 }

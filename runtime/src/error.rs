@@ -7,8 +7,10 @@ use raygrad_compiler::graph::Shape;
 pub enum DeviceError {
     #[error("no GPU adapter {0}; `raygrad devices` lists what there is")]
     NoAdapter(String),
-    #[error("this build has no wgpu backend (feature `wgpu`)")]
-    NotBuilt,
+    #[error("Vulkan cannot be used: {0}")]
+    NoVulkan(String),
+    #[error("this build has no {0} backend (feature `{0}`)")]
+    NotBuilt(&'static str),
     #[error("cannot start {threads} threads: {reason}")]
     Threads { threads: usize, reason: String },
     #[error("the adapter `{name}` refused: {reason}")]

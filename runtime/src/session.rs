@@ -1,6 +1,8 @@
 //! Sessions: programs that share inputs by name, on one device.
 
 use crate::cpu::CpuExecutor;
+#[cfg(feature = "gpu")]
+use crate::gpu::GpuExecutor;
 use crate::{Device, RunError};
 use raygrad_compiler::Program;
 use raygrad_compiler::graph::Shape;
@@ -48,7 +50,9 @@ impl Session {
         let executor: Box<dyn Executor> = match device {
             Device::Cpu { pool } => Box::new(CpuExecutor::new(pool)),
             #[cfg(feature = "wgpu")]
-            Device::Wgpu { gpu } => Box::new(crate::wgpu::WgpuExecutor::new(gpu)),
+            Device::Wgpu { gpu } => Box::new(GpuExecutor::new(crate::wgpu::WgpuApi::new(gpu))),
+            #[cfg(feature = "vulkan")]
+            Device::Vulkan { gpu } => Box::new(GpuExecutor::new(crate::vulkan::VulkanApi::new(gpu)?)),
         };
         Ok(Session { executor, programs: vec![], inputs: BTreeMap::new() })
     }

@@ -9,7 +9,7 @@ use raygrad_runtime::{Device, DeviceError, ProgramId, Session};
 /// Every device that tests run on.
 pub fn devices() -> Vec<Device> {
     let cpu = Device::cpu(Some(2)).unwrap_or_else(|e| panic!("{e}"));
-    std::iter::once(cpu).chain(gpu()).collect()
+    std::iter::once(cpu).chain(gpus()).collect()
 }
 
 /// The devices for tests that compile a hundred kernels or more: on a software driver that takes minutes, so a GPU joins
@@ -19,11 +19,25 @@ pub fn devices_for_large_programs() -> Vec<Device> {
     devices().into_iter().take(if nightly { usize::MAX } else { 1 }).collect()
 }
 
-/// The best adapter, which may be software; `None` only where `RAYGRAD_NO_GPU=1` says that there is none.
-pub fn gpu() -> Option<Device> {
-    match Device::wgpu(None) {
+/// The best adapter of each backend, which may be software.
+pub fn gpus() -> Vec<Device> {
+    [wgpu(), vulkan()].into_iter().flatten().collect()
+}
+
+/// The best adapter through wgpu; `None` only where `RAYGRAD_NO_GPU=1` says that there is none.
+pub fn wgpu() -> Option<Device> {
+    unless_none_is_expected(Device::wgpu(None))
+}
+
+/// The same through Vulkan.
+pub fn vulkan() -> Option<Device> {
+    unless_none_is_expected(Device::vulkan(None))
+}
+
+fn unless_none_is_expected(opened: Result<Device, DeviceError>) -> Option<Device> {
+    match opened {
         Ok(device) => Some(device),
-        Err(DeviceError::NotBuilt) => None,
+        Err(DeviceError::NotBuilt(_)) => None,
         Err(e) if std::env::var_os("RAYGRAD_NO_GPU").is_some_and(|v| v == "1") => {
             println!("skipped, RAYGRAD_NO_GPU is set: {e}");
             None

@@ -5,7 +5,7 @@ use raygrad_compiler::ops::registry;
 use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Axis, Shape, Step, Tensor, compile};
 use raygrad_runtime::{Device, Session};
-use raygrad_tests::backend::{compare, gpu};
+use raygrad_tests::backend::{compare, devices};
 use raygrad_tests::{MidGraph, total};
 
 /// Value, gradients, and the gradient of the gradients' squares.
@@ -42,7 +42,7 @@ fn every_op_on_the_cpu() {
 
 #[test]
 fn inputs_are_set_part_by_part() {
-    for device in [Some(Device::cpu(Some(1)).unwrap()), gpu()].into_iter().flatten() {
+    for device in devices() {
         let place = Axis::new("place", 7);
         let n = Tensor::data("n", Shape::new(&[&place], 1).with_dtype(DType::U32));
         let outputs = vec![("y".to_string(), n.wrapping_add(&Tensor::index(&place)))];

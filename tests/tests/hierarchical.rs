@@ -176,7 +176,7 @@ fn misfits_name_the_call() {
 }
 
 /// The kernels are modules that naga finds valid.
-#[cfg(feature = "wgpu")]
+#[cfg(feature = "gpu")]
 #[test]
 fn a_gpu_can_run_them() {
     use raygrad_kernels::gpu::{Inputs, Limits, lower};

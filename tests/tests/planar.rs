@@ -4,7 +4,7 @@ use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::reference::{Array, Bindings, Data, evaluate};
 use raygrad_compiler::{Step, Tensor};
 use raygrad_runtime::Device;
-use raygrad_tests::backend::{devices_for_large_programs, gpu};
+use raygrad_tests::backend::{devices_for_large_programs, gpus};
 use raygrad_tests::check::check;
 use raygrad_tests::planar::{Planar, SMALL, TINY, Trajectory, combinations, output, train, train_reference};
 use raygrad_tests::{Rng, seed, total};
@@ -167,28 +167,29 @@ fn five_steps_of_training_against_the_reference() {
     }
 }
 
-/// The same training on both devices, losses to 1e-4 in every step.
-fn twenty_steps_on_both(set: &[&str]) {
-    let Some(gpu) = gpu() else { return };
+/// The same training on all devices, losses to 1e-4 in every step.
+fn twenty_steps_on_all(set: &[&str]) {
     let cpu = Device::cpu(Some(2)).expect("starts threads");
     for preset in ["planar-l2g", "planar-barf"] {
         let mut planar = Planar::new(preset, set);
         let expected = train(&cpu, &mut planar, 20);
-        let found = train(&gpu, &mut planar, 20);
-        assert_close(preset, &planar.bindings, &found, &expected, 5e-2);
+        for gpu in gpus() {
+            let found = train(&gpu, &mut planar, 20);
+            assert_close(preset, &planar.bindings, &found, &expected, 5e-2);
+        }
     }
 }
 
 #[test]
-fn twenty_steps_are_the_same_on_the_cpu_and_on_a_gpu() {
-    twenty_steps_on_both(&TINY);
+fn twenty_steps_are_the_same_on_all_devices() {
+    twenty_steps_on_all(&TINY);
 }
 
 #[test]
 #[ignore = "minutes of kernel compilation on software drivers: scripts/test.sh --nightly runs it"]
-fn twenty_steps_of_wide_networks_are_the_same_on_the_cpu_and_on_a_gpu() {
+fn twenty_steps_of_wide_networks_are_the_same_on_all_devices() {
     let set = ["data.patch_crop=[24,32]", "warp.layers=[64,64,64]", "warp.skip=[2]", "field.layers=[64,64]"];
-    twenty_steps_on_both(&set);
+    twenty_steps_on_all(&set);
 }
 
 fn bits(a: &Array) -> Vec<u64> {

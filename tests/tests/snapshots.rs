@@ -60,7 +60,7 @@ fn plans_do_not_depend_on_what_was_recorded_before() {
     assert!(all() == first && planar() == model);
 }
 
-#[cfg(feature = "wgpu")]
+#[cfg(feature = "gpu")]
 mod wgsl {
     use super::{Planar, snapshot};
     use raygrad_compiler::{Step, Target, compile};

@@ -249,7 +249,7 @@ fn both_networks_run_once() {
 }
 
 /// The kernels of the new pieces are modules that naga finds valid, whole steps and views.
-#[cfg(feature = "wgpu")]
+#[cfg(feature = "gpu")]
 #[test]
 fn a_gpu_can_run_every_kind_of_field() {
     use raygrad_kernels::gpu::{Inputs, Limits, lower};

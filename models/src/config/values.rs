@@ -258,6 +258,8 @@ pub enum DeviceChoice {
     Cpu,
     /// The given adapter of `raygrad devices`, or the best one.
     Wgpu(Option<usize>),
+    /// The same, of the Vulkan backend.
+    Vulkan(Option<usize>),
 }
 
 impl fmt::Display for DeviceChoice {
@@ -267,21 +269,27 @@ impl fmt::Display for DeviceChoice {
             DeviceChoice::Cpu => f.write_str("cpu"),
             DeviceChoice::Wgpu(None) => f.write_str("wgpu"),
             DeviceChoice::Wgpu(Some(n)) => write!(f, "wgpu:{n}"),
+            DeviceChoice::Vulkan(None) => f.write_str("vulkan"),
+            DeviceChoice::Vulkan(Some(n)) => write!(f, "vulkan:{n}"),
         }
     }
 }
 impl FromStr for DeviceChoice {
     type Err = String;
     fn from_str(s: &str) -> Result<DeviceChoice, String> {
-        let refused =
-            || format!("expected `auto`, `cpu`, `wgpu` or `wgpu:N`, found `{s}`; `raygrad devices` lists them");
+        let of_backend = |backend: &str| match s.strip_prefix(backend)? {
+            "" => Some(None),
+            number => number.strip_prefix(':')?.parse().ok().map(Some),
+        };
         match s {
             "auto" => Ok(DeviceChoice::Auto),
             "cpu" => Ok(DeviceChoice::Cpu),
-            "wgpu" => Ok(DeviceChoice::Wgpu(None)),
             _ => {
-                let n = s.strip_prefix("wgpu:").ok_or_else(refused)?;
-                n.parse().map(|n| DeviceChoice::Wgpu(Some(n))).map_err(|_| refused())
+                let wgpu = of_backend("wgpu").map(DeviceChoice::Wgpu);
+                wgpu.or_else(|| of_backend("vulkan").map(DeviceChoice::Vulkan)).ok_or_else(|| {
+                    let known = "`auto`, `cpu`, `wgpu`, `vulkan`, `wgpu:N` or `vulkan:N`";
+                    format!("expected {known}, found `{s}`; `raygrad devices` lists them")
+                })
             }
         }
     }

@@ -158,11 +158,7 @@ impl Learner {
 
     /// The device, for people.
     pub fn device_name(&self) -> String {
-        match &self.device {
-            Device::Cpu { pool } => format!("CPU, {} threads", pool.current_num_threads()),
-            #[cfg(feature = "wgpu")]
-            Device::Wgpu { gpu } => gpu.adapter().name.clone(),
-        }
+        self.device.name()
     }
 }
 

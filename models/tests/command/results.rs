@@ -144,7 +144,7 @@ fn bench_prints_the_numbers_of_a_step() {
     assert!((bench["gflop_per_step"].as_f64().unwrap() / expected - 1.0).abs() < 1e-9, "{text}");
 }
 
-#[cfg(feature = "wgpu")]
+#[cfg(feature = "gpu")]
 #[test]
 fn explain_prints_the_plan_and_writes_artefacts() {
     let w = Workplace::new();

@@ -1,10 +1,10 @@
 //! A program on the device: pipelines and bind groups, made once.
 
+use super::adapter::Gpu;
 use super::api;
-use super::gpu::Gpu;
 use crate::RunError;
-use raygrad_compiler::plan::region::BufferId;
-use raygrad_kernels::gpu::{ArenaId, GpuProgram, Kernel, Place};
+use crate::gpu::bound;
+use raygrad_kernels::gpu::{GpuLaunch, Kernel};
 use std::borrow::Cow;
 
 struct Dispatch {
@@ -13,25 +13,40 @@ struct Dispatch {
     workgroups: [u32; 3],
 }
 
-pub(super) struct Loaded {
-    /// Device buffers of the program's own arenas.
-    pub arenas: Vec<api::Buffer>,
+pub(crate) struct Loaded {
     dispatches: Vec<Dispatch>,
-    places: Vec<(Place, usize)>,
 }
 
 impl Loaded {
-    pub fn new(gpu: &Gpu, program: GpuProgram, inputs: &[api::Buffer]) -> Result<Loaded, RunError> {
-        let arenas = program.arenas.iter().map(|a| gpu.buffer(a)).collect::<Result<Vec<_>, _>>()?;
-        let mut loaded = Loaded { arenas, dispatches: vec![], places: program.places };
-        for kernel in program.launches.into_iter().flat_map(|l| l.kernels) {
-            let dispatch = loaded.dispatch(gpu, kernel, inputs)?;
-            loaded.dispatches.push(dispatch);
-        }
-        Ok(loaded)
+    pub fn new(
+        gpu: &Gpu,
+        launches: Vec<GpuLaunch>,
+        inputs: &[api::Buffer],
+        own: &[api::Buffer],
+    ) -> Result<Loaded, RunError> {
+        let kernels = launches.into_iter().flat_map(|l| l.kernels);
+        let dispatches = kernels.map(|k| Dispatch::new(gpu, k, inputs, own)).collect::<Result<_, _>>()?;
+        Ok(Loaded { dispatches })
     }
 
-    fn dispatch(&self, gpu: &Gpu, kernel: Kernel, inputs: &[api::Buffer]) -> Result<Dispatch, RunError> {
+    /// Records and submits all dispatches.
+    pub fn submit(&self, gpu: &Gpu) -> api::SubmissionIndex {
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        {
+            let mut pass = encoder.begin_compute_pass(&Default::default());
+            for d in &self.dispatches {
+                pass.set_pipeline(&d.pipeline);
+                pass.set_bind_group(0, &d.bindings, &[]);
+                let [x, y, z] = d.workgroups;
+                pass.dispatch_workgroups(x, y, z);
+            }
+        }
+        gpu.queue.submit([encoder.finish()])
+    }
+}
+
+impl Dispatch {
+    fn new(gpu: &Gpu, kernel: Kernel, inputs: &[api::Buffer], own: &[api::Buffer]) -> Result<Dispatch, RunError> {
         let name = kernel.name;
         let label = Some(&*name);
         let entries: Vec<api::BindGroupLayoutEntry> = kernel
@@ -55,11 +70,8 @@ impl Loaded {
             .iter()
             .enumerate()
             .map(|(i, b)| {
-                let buffer = match b.arena {
-                    ArenaId::Input(a) => &inputs[a],
-                    ArenaId::Own(a) => &self.arenas[a],
-                };
-                api::BindGroupEntry { binding: i as u32, resource: buffer.as_entire_binding() }
+                let resource = bound(b.arena, inputs, own).as_entire_binding();
+                api::BindGroupEntry { binding: i as u32, resource }
             })
             .collect();
         let bindings =
@@ -96,25 +108,5 @@ impl Loaded {
             other => other,
         })?;
         Ok(Dispatch { pipeline, bindings, workgroups: kernel.workgroups })
-    }
-
-    /// Records and submits all dispatches.
-    pub fn submit(&self, gpu: &Gpu) -> api::SubmissionIndex {
-        let mut encoder = gpu.device.create_command_encoder(&Default::default());
-        {
-            let mut pass = encoder.begin_compute_pass(&Default::default());
-            for d in &self.dispatches {
-                pass.set_pipeline(&d.pipeline);
-                pass.set_bind_group(0, &d.bindings, &[]);
-                let [x, y, z] = d.workgroups;
-                pass.dispatch_workgroups(x, y, z);
-            }
-        }
-        gpu.queue.submit([encoder.finish()])
-    }
-
-    /// Where a buffer lies, with its length in lanes.
-    pub fn place(&self, buffer: BufferId) -> (Place, usize) {
-        self.places[buffer.0 as usize]
     }
 }

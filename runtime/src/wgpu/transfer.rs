@@ -1,7 +1,7 @@
 //! Reading back, through one staging buffer that only grows.
 
+use super::adapter::Gpu;
 use super::api;
-use super::gpu::Gpu;
 use crate::RunError;
 use std::sync::mpsc;
 
@@ -10,7 +10,7 @@ pub(super) struct Staging(Option<api::Buffer>);
 
 impl Staging {
     /// Lanes `first..first + lanes` of a buffer, once everything submitted is done.
-    pub fn read(&mut self, gpu: &Gpu, from: &api::Buffer, first: u32, lanes: usize) -> Result<Vec<u32>, RunError> {
+    pub fn read(&mut self, gpu: &Gpu, from: &api::Buffer, first: usize, lanes: usize) -> Result<Vec<u32>, RunError> {
         let size = 4 * lanes as u64;
         let staging = match &self.0 {
             Some(buffer) if buffer.size() >= size => buffer,

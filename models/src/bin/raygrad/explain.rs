@@ -104,7 +104,7 @@ fn record(experiment: &Experiment) -> Result<(Step, Duration), raygrad::Error> {
 }
 
 /// A file a kernel, numbered in the order in which they run.
-#[cfg(feature = "wgpu")]
+#[cfg(feature = "gpu")]
 fn kernels(program: &Program, artefact: Artefact) -> anyhow::Result<Vec<(String, Vec<u8>)>> {
     use raygrad_kernels::gpu::{Inputs, Limits, lower};
     // No adapter is asked: what a given one cannot bind is refused when the program is loaded onto it.
@@ -124,9 +124,9 @@ fn kernels(program: &Program, artefact: Artefact) -> anyhow::Result<Vec<(String,
     Ok(files)
 }
 
-#[cfg(not(feature = "wgpu"))]
+#[cfg(not(feature = "gpu"))]
 fn kernels(_: &Program, _: Artefact) -> anyhow::Result<Vec<(String, Vec<u8>)>> {
-    anyhow::bail!("this build has no GPU kernels (feature `wgpu`)")
+    anyhow::bail!("this build has no GPU kernels (feature `wgpu` or `vulkan`)")
 }
 
 /// One line an op, operands before users.

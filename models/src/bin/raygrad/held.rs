@@ -11,7 +11,7 @@ pub struct HeldRun {
     /// Folder of its scene, where that has moved.
     #[arg(long, value_name = "DIR")]
     data: Option<String>,
-    /// Where to compute: `auto`, `cpu`, `wgpu`, or `wgpu:N` for the Nth adapter.
+    /// Where to compute: `auto`, `cpu`, `wgpu` or `vulkan`, the latter two with `:N` for the Nth adapter.
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
     /// Threads of the CPU backend. Results do not depend on them.

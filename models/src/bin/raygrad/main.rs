@@ -78,7 +78,7 @@ struct Choice {
     /// Seed of perturbation, initial weights and pixel draws.
     #[arg(long, value_name = "N")]
     seed: Option<String>,
-    /// Where to compute: `auto`, `cpu`, `wgpu`, or `wgpu:N` for the Nth adapter.
+    /// Where to compute: `auto`, `cpu`, `wgpu` or `vulkan`, the latter two with `:N` for the Nth adapter.
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
     /// Threads of the CPU backend. Results do not depend on them.

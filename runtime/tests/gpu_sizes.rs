@@ -1,5 +1,5 @@
-//! The wgpu backend at sizes that need several workgroups, chunks, ragged tiles, and many steps.
-#![cfg(feature = "wgpu")]
+//! The backends for GPUs at sizes that need several workgroups, chunks, ragged tiles, and many steps.
+#![cfg(feature = "gpu")]
 
 use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::functions::adam::{Adam, Moments, StepScalars};
@@ -11,18 +11,6 @@ use raygrad_compiler::{Step, compile};
 use raygrad_runtime::{Device, ProgramId, Session};
 use raygrad_tests::backend::compare;
 use raygrad_tests::{Rng, seed, total};
-
-/// The best adapter; `None` only where the environment says that there is none.
-fn device() -> Option<Device> {
-    match Device::wgpu(None) {
-        Ok(device) => Some(device),
-        Err(e) if std::env::var_os("RAYGRAD_NO_GPU").is_some_and(|v| v == "1") => {
-            println!("skipped, RAYGRAD_NO_GPU is set: {e}");
-            None
-        }
-        Err(e) => panic!("{e}; install a Vulkan driver (mesa-vulkan-drivers), or set RAYGRAD_NO_GPU=1 to skip"),
-    }
-}
 
 /// Binds every input of `step` to seeded numbers.
 fn bind(step: &Step, what: &str) -> Bindings {
@@ -66,20 +54,16 @@ fn layer(device: &Device, frames: usize, rows: usize, inputs: usize, outputs: us
     check(device, outputs_of, 2e-5, &what);
 }
 
-#[test]
-fn layers_of_all_widths() {
-    let Some(device) = device() else { return };
+fn layers_of_all_widths(device: &Device) {
     for (inputs, outputs) in [(2, 1), (3, 4), (5, 7), (16, 12), (34, 64), (64, 64), (64, 3), (70, 33), (130, 66)] {
-        layer(&device, 2, 333, inputs, outputs, false);
+        layer(device, 2, 333, inputs, outputs, false);
     }
-    layer(&device, 3, 100, 20, 40, true);
-    layer(&device, 1, 4096, 8, 8, false);
-    layer(&device, 5, 1, 64, 128, true);
+    layer(device, 3, 100, 20, 40, true);
+    layer(device, 1, 4096, 8, 8, false);
+    layer(device, 5, 1, 64, 128, true);
 }
 
-#[test]
-fn reductions_of_all_sizes() {
-    let Some(device) = device() else { return };
+fn reductions_of_all_sizes(device: &Device) {
     for (a, b) in [(1, 5000), (3, 70000), (5000, 7), (300, 300), (1, 1), (20000, 2)] {
         let (outer, inner) = (Axis::new("outer", a), Axis::new("inner", b));
         let x = Tensor::data("x", Shape::new(&[&outer, &inner], 3));
@@ -92,17 +76,15 @@ fn reductions_of_all_sizes() {
             ("max", y.max_over(&[&outer, &inner])),
             ("max of channels", y.max_channels().max_over(&[&inner])),
         ];
-        check(&device, outputs, 2e-5, &format!("reductions of {a} by {b}"));
+        check(device, outputs, 2e-5, &format!("reductions of {a} by {b}"));
     }
     let row = Axis::new("row", 3000);
     let wide = Tensor::data("x", Shape::new(&[&row], 100));
     let outputs = vec![("wide", wide.sin().sum(&[&row]) * (1.0 / 3000.0)), ("channels", wide.cos().sum_channels())];
-    check(&device, outputs, 2e-5, "reductions of 100 channels");
+    check(device, outputs, 2e-5, "reductions of 100 channels");
 }
 
-#[test]
-fn gathers_and_scatters() {
-    let Some(device) = device() else { return };
+fn gathers_and_scatters(device: &Device) {
     for (slots, rows, channels) in [(5, 3000, 1), (32, 40000, 3), (4, 700, 20), (2000, 5000, 2)] {
         let (slot, row) = (Axis::new("slot", slots), Axis::new("row", rows));
         let table = Tensor::parameter("table", Shape::new(&[&slot], channels));
@@ -110,13 +92,11 @@ fn gathers_and_scatters() {
         let y = table.take(&index, &slot).sin();
         let up = Tensor::data("up", y.shape().clone());
         let g = grad(&total(&(&y * up)), &[&table]);
-        check(&device, vec![("y", y), ("dt", g[0].clone())], 2e-5, &format!("{rows} rows of {slots} x {channels}"));
+        check(device, vec![("y", y), ("dt", g[0].clone())], 2e-5, &format!("{rows} rows of {slots} x {channels}"));
     }
 }
 
-#[test]
-fn compositing() {
-    let Some(device) = device() else { return };
+fn compositing(device: &Device) {
     let (ray, sample) = (Axis::new("ray", 500), Axis::new("sample", 40));
     let density = Tensor::parameter("density", Shape::new(&[&ray, &sample], 1));
     let colour = Tensor::parameter("colour", Shape::new(&[&ray, &sample], 3));
@@ -138,7 +118,7 @@ fn compositing() {
         ("d density", g[0].clone()),
         ("d colour", g[1].clone()),
     ];
-    check(&device, outputs, 2e-5, "compositing");
+    check(device, outputs, 2e-5, "compositing");
 }
 
 /// A network of three layers that learns a function by Adam: one step as a graph.
@@ -237,25 +217,21 @@ impl Training {
     }
 }
 
-#[test]
-fn training_follows_the_reference_and_repeats_bit_by_bit() {
-    let Some(device) = device() else { return };
+fn training_follows_the_reference_and_repeats_bit_by_bit(device: &Device) {
     let training = Training::new();
-    let (losses, parameters) = training.train(&device, 20);
+    let (losses, parameters) = training.train(device, 20);
     let expected = training.reference(20);
     for (t, (found, expected)) in losses.iter().zip(&expected).enumerate() {
         let error = (*found as f64 - expected).abs() / expected;
         assert!(error < 1e-4, "step {t}: {found} instead of {expected}\n{losses:?}\n{expected:?}");
     }
     assert!(losses[19] < 0.9 * losses[0], "{losses:?}");
-    let (again, parameters_again) = training.train(&device, 20);
+    let (again, parameters_again) = training.train(device, 20);
     assert_eq!(losses, again);
     assert!(parameters == parameters_again, "the parameters differ in some bits");
 }
 
-#[test]
-fn two_programs_share_their_inputs() {
-    let Some(device) = device() else { return };
+fn two_programs_share_their_inputs(device: &Device) {
     let row = Axis::new("row", 10);
     let x = Tensor::parameter("x", Shape::new(&[&row], 2));
     let extra = Tensor::data("extra", Shape::new(&[&row], 1));
@@ -272,3 +248,29 @@ fn two_programs_share_their_inputs() {
     assert_eq!(session.read(second, "sum").unwrap(), [45.0, 45.0]);
     assert_eq!(session.get("x").unwrap(), [4.0; 20]);
 }
+
+/// Every test on the best adapter of every backend.
+macro_rules! on_every_backend {
+    ($($name:ident),* $(,)?) => {
+        mod wgpu {
+            $(#[test]
+            fn $name() {
+                raygrad_tests::backend::wgpu().iter().for_each(super::$name);
+            })*
+        }
+        mod vulkan {
+            $(#[test]
+            fn $name() {
+                raygrad_tests::backend::vulkan().iter().for_each(super::$name);
+            })*
+        }
+    };
+}
+on_every_backend!(
+    layers_of_all_widths,
+    reductions_of_all_sizes,
+    gathers_and_scatters,
+    compositing,
+    training_follows_the_reference_and_repeats_bit_by_bit,
+    two_programs_share_their_inputs,
+);

@@ -1,24 +1,13 @@
 //! Adapters and the device opened on one.
 
-use super::{api, bytes};
+use super::api;
+use crate::gpu::{Adapter, AdapterKind, bytes, choose, device_error};
 use crate::{DeviceError, RunError};
 use raygrad_kernels::gpu::{Arena, Limits};
 use std::future::Future;
-use std::path::Path;
 use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::task::{Context, Poll, Waker};
-
-/// An adapter as listed for people.
-#[derive(Clone, Debug)]
-pub struct Adapter {
-    pub name: String,
-    pub backend: &'static str,
-    pub device_type: &'static str,
-    pub driver: String,
-    /// A GPU, not software.
-    pub is_gpu: bool,
-}
 
 /// An open device.
 pub struct Gpu {
@@ -30,13 +19,6 @@ pub struct Gpu {
     failed: Arc<Mutex<Option<String>>>,
 }
 
-/// Whether a GPU can be here. Without a device file of one, every adapter is a software one, and to ask it costs 50 MB and
-/// a tenth of a second.
-fn may_have_gpu() -> bool {
-    let files = ["/dev/dri", "/dev/nvidiactl", "/dev/dxg", "/dev/kgsl-3d0", "/dev/mali0"];
-    !cfg!(target_os = "linux") || files.iter().any(|f| Path::new(f).exists())
-}
-
 impl Gpu {
     /// All adapters, in the order that `wgpu:N` counts.
     pub fn list() -> Vec<Adapter> {
@@ -45,25 +27,14 @@ impl Gpu {
 
     /// The adapter numbered `index`, or the best one: dedicated before integrated before virtual before software.
     pub fn open(index: Option<usize>) -> Result<Gpu, DeviceError> {
-        let all = adapters();
-        let chosen = match index {
-            Some(i) => all.into_iter().nth(i).ok_or_else(|| DeviceError::NoAdapter(format!("number {i}")))?,
-            None => {
-                let best = all.into_iter().min_by_key(|a| rank(a.get_info().device_type));
-                best.ok_or_else(|| DeviceError::NoAdapter("found".into()))?
-            }
-        };
-        Gpu::on(&chosen)
+        Gpu::on(&choose(adapters(), index, |a| kind(a.get_info().device_type))?)
     }
 
     /// A real GPU, if there is one.
     pub fn auto() -> Option<Gpu> {
-        if !may_have_gpu() {
-            return None;
-        }
         let mut all = adapters();
-        all.retain(|a| describe(a).is_gpu);
-        all.sort_by_key(|a| rank(a.get_info().device_type));
+        all.retain(|a| describe(a).is_gpu());
+        all.sort_by_key(|a| kind(a.get_info().device_type));
         all.iter().find_map(|a| Gpu::on(a).ok())
     }
 
@@ -104,16 +75,12 @@ impl Gpu {
         &self.adapter
     }
 
-    pub(super) fn name(&self) -> String {
-        self.adapter.name.clone()
-    }
-
     pub(super) fn limits(&self) -> Limits {
         self.limits
     }
 
     pub(super) fn problem(&self, problem: String) -> RunError {
-        RunError::Device { device: self.name(), problem }
+        device_error(&self.adapter.name, problem)
     }
 
     /// The first error since the last check.
@@ -160,13 +127,13 @@ fn adapters() -> Vec<api::Adapter> {
     block_on(instance.enumerate_adapters(api::Backends::PRIMARY))
 }
 
-fn rank(t: api::DeviceType) -> u32 {
+fn kind(t: api::DeviceType) -> AdapterKind {
     match t {
-        api::DeviceType::DiscreteGpu => 0,
-        api::DeviceType::IntegratedGpu => 1,
-        api::DeviceType::VirtualGpu => 2,
-        api::DeviceType::Other => 3,
-        api::DeviceType::Cpu => 4,
+        api::DeviceType::DiscreteGpu => AdapterKind::Dedicated,
+        api::DeviceType::IntegratedGpu => AdapterKind::Integrated,
+        api::DeviceType::VirtualGpu => AdapterKind::Virtual,
+        api::DeviceType::Other => AdapterKind::Unknown,
+        api::DeviceType::Cpu => AdapterKind::Software,
     }
 }
 
@@ -174,16 +141,9 @@ fn describe(adapter: &api::Adapter) -> Adapter {
     let info = adapter.get_info();
     Adapter {
         name: info.name,
-        backend: info.backend.to_str(),
-        device_type: match info.device_type {
-            api::DeviceType::DiscreteGpu => "dedicated GPU",
-            api::DeviceType::IntegratedGpu => "integrated GPU",
-            api::DeviceType::VirtualGpu => "virtual GPU",
-            api::DeviceType::Cpu => "software",
-            api::DeviceType::Other => "unknown",
-        },
+        api: info.backend.to_str(),
+        kind: kind(info.device_type),
         driver: format!("{} {}", info.driver, info.driver_info).trim().to_string(),
-        is_gpu: rank(info.device_type) <= 2,
     }
 }
 

@@ -1,27 +1,15 @@
-//! The wgpu backend against the f64 reference, on whatever adapter there is; in tests that is software.
+//! The backends for GPUs against the f64 reference, on whatever adapter there is; in tests that is software.
 //!
 //! Without an adapter these tests fail, unless `RAYGRAD_NO_GPU=1` says that none is expected.
-#![cfg(feature = "wgpu")]
+#![cfg(feature = "gpu")]
 
 use raygrad_compiler::Step;
 use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::graph::Tensor;
 use raygrad_compiler::ops::registry;
 use raygrad_runtime::Device;
-use raygrad_tests::backend::compare;
+use raygrad_tests::backend::{self, compare};
 use raygrad_tests::{MidGraph, total};
-
-/// The best adapter; `None` only where the environment says that there is none.
-fn device() -> Option<Device> {
-    match Device::wgpu(None) {
-        Ok(device) => Some(device),
-        Err(e) if std::env::var_os("RAYGRAD_NO_GPU").is_some_and(|v| v == "1") => {
-            println!("skipped, RAYGRAD_NO_GPU is set: {e}");
-            None
-        }
-        Err(e) => panic!("{e}; install a Vulkan driver (mesa-vulkan-drivers), or set RAYGRAD_NO_GPU=1 to skip"),
-    }
-}
 
 /// Value, gradients, and gradients of the gradients' squares.
 fn step(graph: &MidGraph, differentiable: bool) -> Step {
@@ -40,8 +28,16 @@ fn step(graph: &MidGraph, differentiable: bool) -> Step {
 }
 
 #[test]
-fn every_op() {
-    let Some(device) = device() else { return };
+fn every_op_on_wgpu() {
+    backend::wgpu().iter().for_each(every_op);
+}
+
+#[test]
+fn every_op_on_vulkan() {
+    backend::vulkan().iter().for_each(every_op);
+}
+
+fn every_op(device: &Device) {
     let only = std::env::var("RAYGRAD_ONLY").ok();
     let mut failures = vec![];
     for sample in registry().into_iter().filter(|s| only.as_ref().is_none_or(|o| s.name.contains(o.as_str()))) {
@@ -49,7 +45,7 @@ fn every_op() {
         let start = std::time::Instant::now();
         // Rotations round in f32, and small gaps between eigenvalues enlarge what they leave.
         let tolerance = if sample.name == "sym_eig 9" { 1e-3 } else { 2e-5 };
-        if let Err(e) = compare(&device, &step(&graph, sample.differentiable), &graph.bindings, tolerance) {
+        if let Err(e) = compare(device, &step(&graph, sample.differentiable), &graph.bindings, tolerance) {
             failures.push(format!("{}: {e}", sample.name));
         }
         println!("{:5} ms  {}", start.elapsed().as_millis(), sample.name);

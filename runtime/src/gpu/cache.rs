@@ -1,0 +1,75 @@
+//! Compiled pipelines on disk, so that a second start compiles nothing.
+//!
+//! One file an adapter and driver, `raygrad/<key>.bin` in the user's folder for caches: a hash of the driver's bytes, so
+//! that no driver gets a damaged file, then the bytes. A file that cannot be read or written is as good as none.
+
+use std::path::PathBuf;
+
+/// A larger cache is not kept, and starts anew.
+const MOST: usize = 64 << 20;
+const HASH: usize = 32;
+
+/// The file of an adapter's pipelines.
+pub(crate) struct CacheFile {
+    path: Option<PathBuf>,
+    known: Option<blake3::Hash>,
+}
+
+impl CacheFile {
+    /// The file, and what it holds: nothing where there is none, or a damaged one.
+    pub fn open(key: &str) -> (CacheFile, Vec<u8>) {
+        let path = dirs::cache_dir().map(|d| d.join("raygrad").join(format!("{key}.bin")));
+        CacheFile::at(path)
+    }
+
+    fn at(path: Option<PathBuf>) -> (CacheFile, Vec<u8>) {
+        let mut bytes = path.as_ref().and_then(|f| std::fs::read(f).ok()).unwrap_or_default();
+        if bytes.len() < HASH || bytes.len() > MOST {
+            return (CacheFile { path, known: None }, vec![]);
+        }
+        let data = bytes.split_off(HASH);
+        let hash = blake3::hash(&data);
+        match hash.as_bytes()[..] == bytes {
+            true => (CacheFile { path, known: Some(hash) }, data),
+            false => (CacheFile { path, known: None }, vec![]),
+        }
+    }
+
+    /// Writes the file if there is something new; under another name first, since others may read.
+    pub fn save(&self, data: &[u8]) {
+        let hash = blake3::hash(data);
+        let Some(path) = self.path.as_ref().filter(|_| data.len() <= MOST && self.known != Some(hash)) else { return };
+        let part = path.with_extension(format!("{}.part", std::process::id()));
+        let file = [hash.as_bytes(), data].concat();
+        let folder = path.parent().map_or(Ok(()), std::fs::create_dir_all);
+        if folder.and_then(|()| std::fs::write(&part, file)).and_then(|()| std::fs::rename(&part, path)).is_err() {
+            let _ = std::fs::remove_file(&part);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn keeps_what_it_gets_and_trusts_no_damaged_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("deeper").join("adapter.bin");
+        let open = || CacheFile::at(Some(path.clone()));
+        let (file, found) = open();
+        assert!(found.is_empty());
+        file.save(b"pipelines");
+        let (file, found) = open();
+        assert_eq!(found, b"pipelines");
+        file.save(b"other pipelines");
+        assert_eq!(open().1, b"other pipelines");
+        let mut bytes = std::fs::read(&path).unwrap();
+        *bytes.last_mut().unwrap() ^= 1;
+        std::fs::write(&path, &bytes).unwrap();
+        assert!(open().1.is_empty());
+        std::fs::write(&path, b"short").unwrap();
+        assert!(open().1.is_empty());
+        assert_eq!(std::fs::read_dir(path.parent().unwrap()).unwrap().count(), 1);
+    }
+}

@@ -1,0 +1,225 @@
+//! What the backends for GPUs share: where inputs lie, per-step inputs that the host collects, and reading back.
+//!
+//! Everything is made when a program is loaded: arenas, pipelines, bindings. A step only submits.
+
+pub(crate) mod cache;
+
+use crate::session::Executor;
+use crate::{DeviceError, RunError};
+use raygrad_compiler::Program;
+use raygrad_compiler::fuse::TargetKind;
+use raygrad_compiler::ops::input::Role;
+use raygrad_compiler::plan::region::BufferId;
+use raygrad_kernels::gpu::{Arena, ArenaId, GpuLaunch, Inputs, Limits, LowerError, Place, lower};
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::Arc;
+
+/// Steps that may be queued before the host waits for the oldest.
+pub(crate) const QUEUED: usize = 4;
+
+/// What an API for GPUs does. Writes, submissions and reads take effect in the order of the calls.
+pub(crate) trait Api: Send {
+    /// Device memory of an arena.
+    type Buffer: Send;
+    /// Pipelines and bindings of a program.
+    type Loaded: Send;
+
+    /// The adapter's name.
+    fn name(&self) -> String;
+    fn limits(&self) -> Limits;
+    /// A zeroed buffer.
+    fn buffer(&mut self, arena: &Arena) -> Result<Self::Buffer, RunError>;
+    /// Loads the kernels of a program, given the buffers of the inputs' arenas and of its own.
+    fn load(
+        &mut self,
+        launches: Vec<GpuLaunch>,
+        inputs: &[Self::Buffer],
+        own: &[Self::Buffer],
+    ) -> Result<Self::Loaded, RunError>;
+    /// Sets the lanes of a buffer from lane `first` on.
+    fn write(&mut self, buffer: &Self::Buffer, first: usize, lanes: &[u32]) -> Result<(), RunError>;
+    /// Submits all dispatches of a program. Waits only if [`QUEUED`] steps are under way.
+    fn submit(&mut self, program: &Self::Loaded) -> Result<(), RunError>;
+    /// Waits for all work, and reads.
+    fn read(&mut self, buffer: &Self::Buffer, first: usize, lanes: usize) -> Result<Vec<u32>, RunError>;
+}
+
+/// An error of a device, for people.
+pub(crate) fn device_error(name: &str, problem: impl Into<String>) -> RunError {
+    RunError::Device { device: name.into(), problem: problem.into() }
+}
+
+/// Size of an arena's buffer in bytes.
+pub(crate) fn bytes(arena: &Arena) -> u64 {
+    4 * arena.lanes.max(1)
+}
+
+/// What an adapter is; the best kind first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum AdapterKind {
+    Dedicated,
+    Integrated,
+    Virtual,
+    Unknown,
+    /// A driver that computes on the CPU.
+    Software,
+}
+
+impl fmt::Display for AdapterKind {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        f.write_str(match self {
+            AdapterKind::Dedicated => "dedicated GPU",
+            AdapterKind::Integrated => "integrated GPU",
+            AdapterKind::Virtual => "virtual GPU",
+            AdapterKind::Unknown => "unknown",
+            AdapterKind::Software => "software",
+        })
+    }
+}
+
+/// An adapter as listed for people.
+#[derive(Clone, Debug)]
+pub struct Adapter {
+    pub name: String,
+    /// The API that drives it.
+    pub api: &'static str,
+    pub kind: AdapterKind,
+    pub driver: String,
+}
+
+impl Adapter {
+    pub fn is_gpu(&self) -> bool {
+        self.kind <= AdapterKind::Virtual
+    }
+}
+
+/// The adapter that `index` counts, or the first of the best kind.
+pub(crate) fn choose<T>(all: Vec<T>, index: Option<usize>, kind: impl Fn(&T) -> AdapterKind) -> Result<T, DeviceError> {
+    match index {
+        Some(i) => all.into_iter().nth(i).ok_or_else(|| DeviceError::NoAdapter(format!("number {i}"))),
+        None => all.into_iter().min_by_key(kind).ok_or_else(|| DeviceError::NoAdapter("found".into())),
+    }
+}
+
+/// Per-step inputs as the host last set them; written to the device together when a step starts.
+struct Mirror {
+    lanes: Vec<u32>,
+    changed: bool,
+}
+
+/// A program whose kernels are on the device.
+struct OnDevice<A: Api> {
+    loaded: A::Loaded,
+    arenas: Vec<A::Buffer>,
+    places: Vec<(Place, usize)>,
+}
+
+/// Programs on a GPU.
+pub(crate) struct GpuExecutor<A: Api> {
+    // First, so that a dropped session waits for its work before the buffers go.
+    api: A,
+    inputs: Inputs,
+    /// Device buffers of the input arenas.
+    arenas: Vec<A::Buffer>,
+    /// Host copies of the arenas that hold per-step inputs.
+    mirrors: BTreeMap<usize, Mirror>,
+    programs: Vec<OnDevice<A>>,
+}
+
+impl<A: Api> GpuExecutor<A> {
+    pub fn new(api: A) -> GpuExecutor<A> {
+        GpuExecutor { api, inputs: Inputs::default(), arenas: vec![], mirrors: BTreeMap::new(), programs: vec![] }
+    }
+
+    fn lower_error(&self, e: LowerError) -> RunError {
+        match e {
+            LowerError::TooLarge { buffer, bytes, limit } => {
+                RunError::TooLarge { device: self.api.name(), buffer, bytes, limit }
+            }
+            other => device_error(&self.api.name(), other.to_string()),
+        }
+    }
+
+    /// Where an input lies, with its length in lanes.
+    fn input(&self, name: &str) -> Result<(usize, Place, usize), RunError> {
+        let (place, shape) = self.inputs.places.get(name).ok_or_else(|| RunError::UnknownInput(name.into()))?;
+        match place.arena {
+            ArenaId::Input(arena) => Ok((arena, *place, shape.lanes())),
+            ArenaId::Own(_) => Err(RunError::UnknownInput(name.into())),
+        }
+    }
+
+    /// Writes what the host changed of the per-step inputs.
+    fn flush(&mut self) -> Result<(), RunError> {
+        for (arena, mirror) in &mut self.mirrors {
+            if std::mem::take(&mut mirror.changed) {
+                self.api.write(&self.arenas[*arena], 0, &mirror.lanes)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+impl<A: Api> Executor for GpuExecutor<A> {
+    fn add(&mut self, program: Arc<Program>) -> Result<usize, RunError> {
+        if program.target.kind != TargetKind::Gpu {
+            return Err(RunError::Target(program.target.kind));
+        }
+        let lowered = lower(&program, &mut self.inputs, &self.api.limits()).map_err(|e| self.lower_error(e))?;
+        for arena in &self.inputs.arenas[self.arenas.len()..] {
+            self.arenas.push(self.api.buffer(arena)?);
+        }
+        for (name, role, _) in program.inputs() {
+            if role == Role::PerStep {
+                let (arena, _, _) = self.input(name)?;
+                let lanes = self.inputs.arenas[arena].lanes as usize;
+                self.mirrors.entry(arena).or_insert_with(|| Mirror { lanes: vec![0; lanes], changed: false });
+            }
+        }
+        let arenas = lowered.arenas.iter().map(|a| self.api.buffer(a)).collect::<Result<Vec<_>, _>>()?;
+        let loaded = self.api.load(lowered.launches, &self.arenas, &arenas)?;
+        self.programs.push(OnDevice { loaded, arenas, places: lowered.places });
+        Ok(self.programs.len() - 1)
+    }
+
+    fn set(&mut self, input: &str, first: usize, lanes: &[u32]) -> Result<(), RunError> {
+        let (arena, place, _) = self.input(input)?;
+        let first = place.offset as usize + first;
+        match self.mirrors.get_mut(&arena) {
+            Some(mirror) => {
+                mirror.lanes[first..first + lanes.len()].copy_from_slice(lanes);
+                mirror.changed = true;
+                Ok(())
+            }
+            None => self.api.write(&self.arenas[arena], first, lanes),
+        }
+    }
+
+    fn get(&mut self, input: &str) -> Result<Vec<u32>, RunError> {
+        self.flush()?;
+        let (arena, place, lanes) = self.input(input)?;
+        self.api.read(&self.arenas[arena], place.offset as usize, lanes)
+    }
+
+    fn run(&mut self, program: usize) -> Result<(), RunError> {
+        self.flush()?;
+        self.api.submit(&self.programs[program].loaded)
+    }
+
+    fn output(&mut self, program: usize, buffer: BufferId) -> Result<Vec<u32>, RunError> {
+        self.flush()?;
+        let program = &self.programs[program];
+        let (place, lanes) = program.places[buffer.0 as usize];
+        let from = bound(place.arena, &self.arenas, &program.arenas);
+        self.api.read(from, place.offset as usize, lanes)
+    }
+}
+
+/// The buffer of an arena.
+pub(crate) fn bound<'a, B>(arena: ArenaId, inputs: &'a [B], own: &'a [B]) -> &'a B {
+    match arena {
+        ArenaId::Input(i) => &inputs[i],
+        ArenaId::Own(i) => &own[i],
+    }
+}

@@ -1,0 +1,215 @@
+//! Adapters and the device opened on one.
+
+use super::instance::Instance;
+use crate::gpu::cache::CacheFile;
+use crate::gpu::{Adapter, AdapterKind, choose, device_error};
+use crate::{DeviceError, RunError};
+use ash::{khr, vk};
+use gpu_allocator::AllocationSizes;
+use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
+use raygrad_kernels::gpu::Limits;
+use std::ffi::CStr;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// Memory is taken from the driver in blocks of this size, larger buffers by themselves.
+const DEVICE_BLOCK: u64 = 32 << 20;
+const HOST_BLOCK: u64 = 8 << 20;
+
+/// An open device.
+pub struct Gpu {
+    pub(super) device: ash::Device,
+    pub(super) family: u32,
+    /// Null where the driver has none.
+    pub(super) cache: vk::PipelineCache,
+    cache_file: CacheFile,
+    queue: Mutex<vk::Queue>,
+    /// `None` only while the device goes.
+    allocator: Mutex<Option<Allocator>>,
+    adapter: Adapter,
+    limits: Limits,
+    instance: Instance,
+}
+
+impl Gpu {
+    /// All adapters, in the order that `vulkan:N` counts. Without a Vulkan loader there are none.
+    pub fn list() -> Vec<Adapter> {
+        let Ok(instance) = Instance::new() else { return vec![] };
+        physical_devices(&instance).into_iter().map(|p| describe(&instance, p)).collect()
+    }
+
+    /// The adapter numbered `index`, or the best one: dedicated before integrated before virtual before software.
+    pub fn open(index: Option<usize>) -> Result<Gpu, DeviceError> {
+        let instance = Instance::new()?;
+        let all = physical_devices(&instance);
+        let physical = choose(all, index, |p| describe(&instance, *p).kind)?;
+        Gpu::on(instance, physical)
+    }
+
+    /// A real GPU, if there is one.
+    pub fn auto() -> Option<Gpu> {
+        let best = Gpu::open(None).ok()?;
+        best.adapter.is_gpu().then_some(best)
+    }
+
+    fn on(instance: Instance, physical: vk::PhysicalDevice) -> Result<Gpu, DeviceError> {
+        let adapter = describe(&instance, physical);
+        let refused = |reason: String| DeviceError::Adapter { name: adapter.name.clone(), reason };
+        let vulkan = |e: vk::Result| refused(describe_result(e));
+        let raw = &instance.raw;
+        // SAFETY: the physical device belongs to the instance, and every handle made here is used while the device lives.
+        unsafe {
+            let families = raw.get_physical_device_queue_family_properties(physical);
+            let computes = families.iter().position(|f| f.queue_flags.contains(vk::QueueFlags::COMPUTE));
+            let family = computes.ok_or_else(|| refused("it cannot compute".into()))? as u32;
+            let queues = [vk::DeviceQueueCreateInfo::default().queue_family_index(family).queue_priorities(&[1.0])];
+            // A driver on top of another API wants to hear that we know.
+            let known = raw.enumerate_device_extension_properties(physical).map_err(vulkan)?;
+            let portability = khr::portability_subset::NAME;
+            let extensions: Vec<_> = known
+                .iter()
+                .filter(|e| e.extension_name_as_c_str() == Ok(portability))
+                .map(|_| portability.as_ptr())
+                .collect();
+            let description =
+                vk::DeviceCreateInfo::default().queue_create_infos(&queues).enabled_extension_names(&extensions);
+            let device = raw.create_device(physical, &description, None).map_err(vulkan)?;
+            let queue = device.get_device_queue(family, 0);
+            let mut most = vk::PhysicalDeviceMaintenance3Properties::default();
+            let mut properties = vk::PhysicalDeviceProperties2::default().push_next(&mut most);
+            raw.get_physical_device_properties2(physical, &mut properties);
+            let properties = properties.properties;
+            let limits = Limits {
+                max_binding: most.max_memory_allocation_size.min(properties.limits.max_storage_buffer_range as u64),
+                max_workgroups: properties.limits.max_compute_work_group_count[0],
+            };
+            let allocator = Allocator::new(&AllocatorCreateDesc {
+                instance: raw.clone(),
+                device: device.clone(),
+                physical_device: physical,
+                debug_settings: Default::default(),
+                buffer_device_address: false,
+                allocation_sizes: AllocationSizes::new(DEVICE_BLOCK, HOST_BLOCK),
+            });
+            let allocator = match allocator {
+                Ok(allocator) => allocator,
+                Err(e) => {
+                    device.destroy_device(None);
+                    return Err(refused(e.to_string()));
+                }
+            };
+            let id: String = properties.pipeline_cache_uuid.iter().map(|b| format!("{b:02x}")).collect();
+            let (cache_file, known) = CacheFile::open(&format!("vulkan-{id}"));
+            let description = vk::PipelineCacheCreateInfo::default().initial_data(&known);
+            let cache = device.create_pipeline_cache(&description, None).unwrap_or_default();
+            Ok(Gpu {
+                cache,
+                cache_file,
+                queue: Mutex::new(queue),
+                allocator: Mutex::new(Some(allocator)),
+                device,
+                family,
+                adapter,
+                limits,
+                instance,
+            })
+        }
+    }
+
+    pub fn adapter(&self) -> &Adapter {
+        &self.adapter
+    }
+
+    pub(super) fn limits(&self) -> Limits {
+        self.limits
+    }
+
+    /// The queue, for one submission.
+    pub(super) fn queue(&self) -> MutexGuard<'_, vk::Queue> {
+        self.queue.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Calls `f` with the allocator.
+    pub(super) fn allocate<T>(&self, f: impl FnOnce(&mut Allocator) -> Result<T, RunError>) -> Result<T, RunError> {
+        match &mut *self.allocator.lock().unwrap_or_else(PoisonError::into_inner) {
+            Some(allocator) => f(allocator),
+            None => Err(self.problem("the device is closed")),
+        }
+    }
+
+    pub(super) fn problem(&self, problem: impl Into<String>) -> RunError {
+        device_error(&self.adapter.name, problem)
+    }
+
+    /// The error of a call.
+    pub(super) fn error(&self, e: vk::Result) -> RunError {
+        self.problem(describe_result(e))
+    }
+
+    /// What the validation layer said since the last check.
+    pub(super) fn check(&self) -> Result<(), RunError> {
+        match self.instance.complaints.take() {
+            Some(text) => Err(self.problem(text)),
+            None => Ok(()),
+        }
+    }
+}
+
+impl Drop for Gpu {
+    fn drop(&mut self) {
+        // SAFETY: sessions and buffers are gone, they hold the device.
+        unsafe {
+            // After the loss of the device nothing runs any more either.
+            let _ = self.device.device_wait_idle();
+            if let Ok(pipelines) = self.device.get_pipeline_cache_data(self.cache) {
+                self.cache_file.save(&pipelines);
+            }
+            self.device.destroy_pipeline_cache(self.cache, None);
+            self.allocator.lock().unwrap_or_else(PoisonError::into_inner).take();
+            self.device.destroy_device(None);
+        }
+    }
+}
+
+fn describe_result(e: vk::Result) -> String {
+    match e {
+        vk::Result::ERROR_DEVICE_LOST => "the device was lost".into(),
+        vk::Result::ERROR_OUT_OF_DEVICE_MEMORY => "out of device memory".into(),
+        vk::Result::ERROR_OUT_OF_HOST_MEMORY => "out of memory".into(),
+        other => other.to_string(),
+    }
+}
+
+/// Those that know Vulkan 1.1, which brought SPIR-V 1.3.
+fn physical_devices(instance: &Instance) -> Vec<vk::PhysicalDevice> {
+    // SAFETY: handles of this instance.
+    unsafe {
+        let all = instance.raw.enumerate_physical_devices().unwrap_or_default();
+        let knows =
+            |p: &vk::PhysicalDevice| instance.raw.get_physical_device_properties(*p).api_version >= vk::API_VERSION_1_1;
+        all.into_iter().filter(knows).collect()
+    }
+}
+
+fn describe(instance: &Instance, physical: vk::PhysicalDevice) -> Adapter {
+    // SAFETY: a physical device of this instance.
+    let properties = unsafe { instance.raw.get_physical_device_properties(physical) };
+    let name = properties.device_name_as_c_str().map_or("unnamed".into(), CStr::to_string_lossy);
+    let version = properties.api_version;
+    Adapter {
+        name: name.into_owned(),
+        api: "vulkan",
+        kind: match properties.device_type {
+            vk::PhysicalDeviceType::DISCRETE_GPU => AdapterKind::Dedicated,
+            vk::PhysicalDeviceType::INTEGRATED_GPU => AdapterKind::Integrated,
+            vk::PhysicalDeviceType::VIRTUAL_GPU => AdapterKind::Virtual,
+            vk::PhysicalDeviceType::CPU => AdapterKind::Software,
+            _ => AdapterKind::Unknown,
+        },
+        driver: format!(
+            "Vulkan {}.{}.{}",
+            vk::api_version_major(version),
+            vk::api_version_minor(version),
+            vk::api_version_patch(version)
+        ),
+    }
+}
