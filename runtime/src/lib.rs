@@ -4,6 +4,7 @@
 //! and an evaluation see the same parameters. The `cpu` backend needs no driver; `wgpu` runs the same programs on any
 //! adapter, `vulkan` on a Vulkan driver without a layer in between.
 
+mod ceilings;
 pub mod cpu;
 mod device;
 mod error;
@@ -15,6 +16,7 @@ pub mod vulkan;
 #[cfg(feature = "wgpu")]
 pub mod wgpu;
 
+pub use ceilings::Ceilings;
 pub use device::{Device, DeviceInfo};
 pub use error::{DeviceError, RunError};
 #[cfg(feature = "gpu")]

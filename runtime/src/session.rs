@@ -22,6 +22,8 @@ pub(crate) trait Executor: Send {
     fn get(&mut self, input: &str) -> Result<Vec<u32>, RunError>;
     /// Runs a program once; need not wait for it.
     fn run(&mut self, program: usize) -> Result<(), RunError>;
+    /// Runs a program once and waits: seconds of every launch, or `None` (and nothing ran) where the device has no clock.
+    fn profile(&mut self, program: usize) -> Result<Option<Vec<f64>>, RunError>;
     /// An output of a program's last run.
     fn output(&mut self, program: usize, buffer: BufferId) -> Result<Vec<u32>, RunError>;
 }
@@ -133,6 +135,12 @@ impl Session {
     /// Runs a program once. On a GPU this only submits.
     pub fn run(&mut self, program: ProgramId) -> Result<(), RunError> {
         self.executor.run(program.0)
+    }
+
+    /// Runs a program once, by the device's clock: seconds of each of its launches. `None` where the device has no clock;
+    /// then nothing ran. Waits for the device.
+    pub fn profile(&mut self, program: ProgramId) -> Result<Option<Vec<f64>>, RunError> {
+        self.executor.profile(program.0)
     }
 
     /// A float output of the program's last run, in host order; waits for the device.

@@ -110,10 +110,11 @@ fn eigen() -> Step {
     step(&[("values", &values), ("vectors", &vectors)])
 }
 
-/// Adam on a wide parameter: all launches work lane by lane and in place.
+/// Adam on a wide parameter whose gradient comes in parts: all launches work lane by lane and in place.
 fn update() -> Step {
     let p = Tensor::parameter("p", Shape::new(&[], (64, 64)));
-    let g = Tensor::data("g", Shape::new(&[], (64, 64)));
+    let part = |name: &str| Tensor::data(name, Shape::new(&[], 32 * 64));
+    let g = concat([&part("g0"), &part("g1")]).reshape((64, 64));
     let scalar = |name: &str| Tensor::per_step(name, Shape::new(&[], 1));
     let scalars = StepScalars { lr: scalar("lr"), bias1: scalar("bias1"), bias2: scalar("bias2") };
     let old = Moments::of(&p);

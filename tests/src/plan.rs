@@ -11,6 +11,7 @@ use raygrad_compiler::plan::BufferKind;
 use raygrad_compiler::plan::region::{Grain, Inst, Region, RegionOp, Store};
 use raygrad_compiler::reference::{Array, Bindings, Lane};
 use raygrad_compiler::scalar::{DType, Prim, ScalarProgram, Val};
+use std::collections::BTreeSet;
 
 /// Values of every buffer after one run, by [`BufferId`]; inputs are taken from `bindings`, or zero.
 pub fn run(program: &Program, bindings: &Bindings) -> Result<Vec<Array>, String> {
@@ -51,6 +52,21 @@ fn overwritten(program: &Program, region: &Region, buffers: &mut [Array]) {
     }
 }
 
+/// Whether no channel of anything computed from instruction `at` needs another channel of it.
+fn stays_in_its_channel(region: &Region, at: usize) -> bool {
+    let width = region.body[at].channels;
+    let mut reached = BTreeSet::from([at]);
+    for (i, inst) in region.body.iter().enumerate().skip(at + 1) {
+        if inst.inputs.iter().any(|input| reached.contains(&(input.0 as usize))) {
+            if !matches!(inst.op, RegionOp::Map(_)) || inst.channels != width {
+                return false;
+            }
+            reached.insert(i);
+        }
+    }
+    true
+}
+
 /// Refuses a launch that replaces a buffer of which one position reads what another one writes.
 fn replaced(region: &Region) -> Result<(), String> {
     for (at, inst) in region.body.iter().enumerate() {
@@ -63,7 +79,7 @@ fn replaced(region: &Region) -> Result<(), String> {
         let own = matches!(store, Store::Write { .. })
             && matches!(inst.op, RegionOp::Load(_))
             && inst.axes == region.domain
-            && (region.grain == Grain::Row || !region.body.iter().any(|i| matches!(i.op, RegionOp::Pick(_))));
+            && (region.grain == Grain::Row || stays_in_its_channel(region, at));
         if !own {
             return Err(format!("instruction {at} reads b{} while it is replaced", read.0));
         }

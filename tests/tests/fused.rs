@@ -121,6 +121,11 @@ fn parameters_that_take_each_others_lanes() {
     let rotated: Vec<usize> = (0..640).map(|c| (c + 70) % 640).collect();
     inputs.check(&[], &[(&q, &q.pick(&rotated))]);
     inputs.check(&[&p], &[(&q, &(q.pick(&rotated) * 0.5))]);
+    // Next to a value whose channels are rearranged, and beside one that others read in every channel.
+    let (g, r) = (inputs.parameter("g", Shape::new(&[], 640)), inputs.parameter("r", Shape::new(&[], 1)));
+    inputs.check(&[], &[(&q, &(&q - &g.pick(&rotated) * 0.5)), (&p, &(&p * 0.5))]);
+    inputs.check(&[], &[(&q, &(&q * &r)), (&r, &(&r * 0.5))]);
+    inputs.check(&[], &[(&q, &(&q * &r - &g.pick(&rotated))), (&r, &(&r * q.sum_channels()))]);
 }
 
 #[test]

@@ -96,6 +96,17 @@ impl Learner {
         Ok(())
     }
 
+    /// The same by the device's clock: seconds of every launch. `None` where it has no clock; then nothing was done.
+    pub fn profile(&mut self, program: ProgramId) -> Result<Option<Vec<f64>>, Error> {
+        self.set_rates()?;
+        let seconds = self.session.profile(program)?;
+        if seconds.is_some() {
+            self.step += 1;
+            self.stepped = true;
+        }
+        Ok(seconds)
+    }
+
     /// Whether the outputs of the training program are those of the step that led to the present state.
     pub fn has_stepped(&self) -> bool {
         self.stepped
@@ -154,6 +165,10 @@ impl Learner {
         }
         (self.step, self.stepped) = (checkpoint.step, false);
         Ok(())
+    }
+
+    pub fn device(&self) -> &Device {
+        &self.device
     }
 
     /// The device, for people.

@@ -16,6 +16,7 @@ use rayon::prelude::*;
 use std::cell::RefCell;
 use std::collections::HashMap;
 use std::sync::Arc;
+use std::time::Instant;
 
 /// Lanes of a flat launch that one task works through.
 const FLAT_TASK: usize = 16 * 1024;
@@ -120,6 +121,30 @@ impl Executor for CpuExecutor {
     }
 
     fn run(&mut self, program: usize) -> Result<(), RunError> {
+        self.run_each(program, |_| {});
+        Ok(())
+    }
+
+    fn profile(&mut self, program: usize) -> Result<Option<Vec<f64>>, RunError> {
+        let mut seconds = vec![];
+        let mut before = Instant::now();
+        self.run_each(program, |_| {
+            let now = Instant::now();
+            seconds.push((now - std::mem::replace(&mut before, now)).as_secs_f64());
+        });
+        Ok(Some(seconds))
+    }
+
+    fn output(&mut self, program: usize, buffer: BufferId) -> Result<Vec<u32>, RunError> {
+        let loaded = &self.programs[program];
+        let (place, lanes) = (loaded.places[buffer.0 as usize], loaded.lanes[buffer.0 as usize]);
+        Ok(bytemuck::cast_slice(&self.memory[place][..lanes]).to_vec())
+    }
+}
+
+impl CpuExecutor {
+    /// Runs all launches; `done` hears the number of each.
+    fn run_each(&mut self, program: usize, mut done: impl FnMut(usize) + Send) {
         let loaded = &mut self.programs[program];
         let buffers: Vec<*mut f32> = loaded.places.iter().map(|p| self.memory[*p].as_mut_ptr()).collect();
         let memory = Memory { buffers: &buffers };
@@ -127,22 +152,16 @@ impl Executor for CpuExecutor {
         let (packed, accumulators) = (&mut loaded.packed, &mut loaded.accumulators);
         let (launches, lanes) = (&loaded.launches, &loaded.lanes);
         self.pool.install(|| {
-            for launch in launches {
+            for (i, launch) in launches.iter().enumerate() {
                 for flat in &launch.flats {
                     run_flat(flat, memory, isa);
                 }
                 if let Some(tiles) = &launch.tiles {
                     run_launch(tiles, memory, isa, packed, accumulators, lanes);
                 }
+                done(i);
             }
         });
-        Ok(())
-    }
-
-    fn output(&mut self, program: usize, buffer: BufferId) -> Result<Vec<u32>, RunError> {
-        let loaded = &self.programs[program];
-        let (place, lanes) = (loaded.places[buffer.0 as usize], loaded.lanes[buffer.0 as usize]);
-        Ok(bytemuck::cast_slice(&self.memory[place][..lanes]).to_vec())
     }
 }
 

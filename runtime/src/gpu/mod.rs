@@ -41,6 +41,8 @@ pub(crate) trait Api: Send {
     fn write(&mut self, buffer: &Self::Buffer, first: usize, lanes: &[u32]) -> Result<(), RunError>;
     /// Submits all dispatches of a program. Waits only if [`QUEUED`] steps are under way.
     fn submit(&mut self, program: &Self::Loaded) -> Result<(), RunError>;
+    /// Runs a program and waits: seconds of every launch by the device's clock; `None` where it has none, and nothing ran.
+    fn profile(&mut self, program: &Self::Loaded) -> Result<Option<Vec<f64>>, RunError>;
     /// Waits for all work, and reads.
     fn read(&mut self, buffer: &Self::Buffer, first: usize, lanes: usize) -> Result<Vec<u32>, RunError>;
 }
@@ -205,6 +207,11 @@ impl<A: Api> Executor for GpuExecutor<A> {
     fn run(&mut self, program: usize) -> Result<(), RunError> {
         self.flush()?;
         self.api.submit(&self.programs[program].loaded)
+    }
+
+    fn profile(&mut self, program: usize) -> Result<Option<Vec<f64>>, RunError> {
+        self.flush()?;
+        self.api.profile(&self.programs[program].loaded)
     }
 
     fn output(&mut self, program: usize, buffer: BufferId) -> Result<Vec<u32>, RunError> {

@@ -27,7 +27,16 @@ pub struct Gpu {
     allocator: Mutex<Option<Allocator>>,
     adapter: Adapter,
     limits: Limits,
+    clock: Option<Clock>,
     instance: Instance,
+}
+
+/// How the device counts time.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Clock {
+    pub seconds_per_tick: f64,
+    /// Valid bits of a count; it starts again from zero after them.
+    pub mask: u64,
 }
 
 impl Gpu {
@@ -74,6 +83,7 @@ impl Gpu {
                 vk::DeviceCreateInfo::default().queue_create_infos(&queues).enabled_extension_names(&extensions);
             let device = raw.create_device(physical, &description, None).map_err(vulkan)?;
             let queue = device.get_device_queue(family, 0);
+            let bits = families[family as usize].timestamp_valid_bits;
             let mut most = vk::PhysicalDeviceMaintenance3Properties::default();
             let mut properties = vk::PhysicalDeviceProperties2::default().push_next(&mut most);
             raw.get_physical_device_properties2(physical, &mut properties);
@@ -82,6 +92,10 @@ impl Gpu {
                 max_binding: most.max_memory_allocation_size.min(properties.limits.max_storage_buffer_range as u64),
                 max_workgroups: properties.limits.max_compute_work_group_count[0],
             };
+            let clock = (bits > 0).then(|| Clock {
+                seconds_per_tick: 1e-9 * f64::from(properties.limits.timestamp_period),
+                mask: u64::MAX >> (64 - bits.min(64)),
+            });
             let allocator = Allocator::new(&AllocatorCreateDesc {
                 instance: raw.clone(),
                 device: device.clone(),
@@ -110,6 +124,7 @@ impl Gpu {
                 family,
                 adapter,
                 limits,
+                clock,
                 instance,
             })
         }
@@ -121,6 +136,10 @@ impl Gpu {
 
     pub(super) fn limits(&self) -> Limits {
         self.limits
+    }
+
+    pub(super) fn clock(&self) -> Option<Clock> {
+        self.clock
     }
 
     /// The queue, for one submission.

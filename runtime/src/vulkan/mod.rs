@@ -15,7 +15,7 @@ pub use adapter::Gpu;
 use crate::RunError;
 use crate::gpu::Api;
 use memory::Buffer;
-use program::Loaded;
+use program::{Loaded, Timed};
 use queue::Queue;
 use raygrad_kernels::gpu::{Arena, GpuLaunch, Limits};
 use std::sync::Arc;
@@ -60,6 +60,13 @@ impl Api for VulkanApi {
 
     fn submit(&mut self, program: &Loaded) -> Result<(), RunError> {
         self.queue.submit(Some(program.commands))
+    }
+
+    fn profile(&mut self, program: &Loaded) -> Result<Option<Vec<f64>>, RunError> {
+        let Some(clock) = self.gpu.clock() else { return Ok(None) };
+        let timed = Timed::new(program, clock)?;
+        self.queue.run(timed.commands)?;
+        timed.seconds().map(Some)
     }
 
     fn read(&mut self, buffer: &Buffer, first: usize, lanes: usize) -> Result<Vec<u32>, RunError> {

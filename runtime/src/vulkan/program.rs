@@ -1,6 +1,6 @@
 //! A program on the device: pipelines, bindings, and all dispatches in one command buffer.
 
-use super::adapter::Gpu;
+use super::adapter::{Clock, Gpu};
 use super::memory::Buffer;
 use super::queue::barrier;
 use crate::RunError;
@@ -9,6 +9,7 @@ use ash::vk;
 use raygrad_kernels::gpu::{GpuLaunch, Kernel};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::sync::Arc;
 
 /// Bindings of kernels that bind the same number of buffers.
@@ -17,11 +18,20 @@ struct Layouts {
     pipeline: vk::PipelineLayout,
 }
 
+struct Dispatch {
+    pipeline: vk::Pipeline,
+    layout: vk::PipelineLayout,
+    set: vk::DescriptorSet,
+    workgroups: [u32; 3],
+}
+
 pub(crate) struct Loaded {
     /// Recorded once, submitted at every step.
     pub(super) commands: vk::CommandBuffer,
     layouts: BTreeMap<usize, Layouts>,
-    pipelines: Vec<vk::Pipeline>,
+    dispatches: Vec<Dispatch>,
+    /// Those of every launch.
+    launches: Vec<Range<usize>>,
     descriptors: vk::DescriptorPool,
     pool: vk::CommandPool,
     gpu: Arc<Gpu>,
@@ -34,33 +44,46 @@ impl Loaded {
         inputs: &[Buffer],
         own: &[Buffer],
     ) -> Result<Loaded, RunError> {
-        let kernels: Vec<Kernel> = launches.into_iter().flat_map(|l| l.kernels).collect();
         // Null handles may be destroyed, so that what was made goes with `loaded` if something fails.
         let mut loaded = Loaded {
             commands: vk::CommandBuffer::null(),
             layouts: BTreeMap::new(),
-            pipelines: vec![],
+            dispatches: vec![],
+            launches: vec![],
             descriptors: vk::DescriptorPool::null(),
             pool: vk::CommandPool::null(),
             gpu: gpu.clone(),
         };
+        let mut kernels: Vec<Kernel> = vec![];
+        for launch in launches {
+            loaded.launches.push(kernels.len()..kernels.len() + launch.kernels.len());
+            kernels.extend(launch.kernels);
+        }
         for kernel in &kernels {
             loaded.layouts(kernel.bindings.len())?;
         }
         // Drivers compile here, each kernel by itself.
         let pipelines: Vec<_> = kernels.par_iter().map(|k| loaded.pipeline(k)).collect();
         let mut failed = None;
-        for pipeline in pipelines {
+        for (kernel, pipeline) in kernels.iter().zip(pipelines) {
             match pipeline {
-                Ok(pipeline) => loaded.pipelines.push(pipeline),
+                Ok(pipeline) => loaded.dispatches.push(Dispatch {
+                    pipeline,
+                    layout: loaded.layouts[&kernel.bindings.len()].pipeline,
+                    set: vk::DescriptorSet::null(),
+                    workgroups: kernel.workgroups,
+                }),
                 Err(e) => failed = failed.or(Some(e)),
             }
         }
         if let Some(e) = failed {
             return Err(e);
         }
-        let sets = loaded.bind(&kernels, inputs, own)?;
-        loaded.record(&kernels, &sets)?;
+        loaded.bind(&kernels, inputs, own)?;
+        let description = vk::CommandPoolCreateInfo::default().queue_family_index(gpu.family);
+        // SAFETY: a handle of this device.
+        loaded.pool = unsafe { gpu.device.create_command_pool(&description, None) }.map_err(|e| gpu.error(e))?;
+        loaded.commands = loaded.record(None)?;
         gpu.check()?;
         Ok(loaded)
     }
@@ -118,14 +141,9 @@ impl Loaded {
     }
 
     /// A descriptor set a kernel.
-    fn bind(
-        &mut self,
-        kernels: &[Kernel],
-        inputs: &[Buffer],
-        own: &[Buffer],
-    ) -> Result<Vec<vk::DescriptorSet>, RunError> {
+    fn bind(&mut self, kernels: &[Kernel], inputs: &[Buffer], own: &[Buffer]) -> Result<(), RunError> {
         if kernels.is_empty() {
-            return Ok(vec![]);
+            return Ok(());
         }
         let gpu = &self.gpu;
         let buffers: usize = kernels.iter().map(|k| k.bindings.len()).sum();
@@ -141,7 +159,8 @@ impl Loaded {
             let description =
                 vk::DescriptorSetAllocateInfo::default().descriptor_pool(self.descriptors).set_layouts(&layouts);
             let sets = gpu.device.allocate_descriptor_sets(&description).map_err(|e| gpu.error(e))?;
-            for (kernel, set) in kernels.iter().zip(&sets) {
+            for ((kernel, set), dispatch) in kernels.iter().zip(sets).zip(&mut self.dispatches) {
+                dispatch.set = set;
                 let buffers: Vec<_> = kernel
                     .bindings
                     .iter()
@@ -152,22 +171,21 @@ impl Loaded {
                     })
                     .collect();
                 let write = vk::WriteDescriptorSet::default()
-                    .dst_set(*set)
+                    .dst_set(set)
                     .descriptor_type(vk::DescriptorType::STORAGE_BUFFER)
                     .buffer_info(&buffers);
                 gpu.device.update_descriptor_sets(&[write], &[]);
             }
-            Ok(sets)
+            Ok(())
         }
     }
 
-    /// Records all dispatches, each after the one before it.
-    fn record(&mut self, kernels: &[Kernel], sets: &[vk::DescriptorSet]) -> Result<(), RunError> {
+    /// A new command buffer with all dispatches, each after the one before it; the clock is read at the start and after
+    /// every launch.
+    fn record(&self, clock: Option<vk::QueryPool>) -> Result<vk::CommandBuffer, RunError> {
         let gpu = &self.gpu;
-        let description = vk::CommandPoolCreateInfo::default().queue_family_index(gpu.family);
-        // SAFETY: handles of this device.
+        // SAFETY: handles of this device; the queries are as many as launches and one more.
         unsafe {
-            self.pool = gpu.device.create_command_pool(&description, None).map_err(|e| gpu.error(e))?;
             let description = vk::CommandBufferAllocateInfo::default()
                 .command_pool(self.pool)
                 .level(vk::CommandBufferLevel::PRIMARY)
@@ -177,19 +195,78 @@ impl Loaded {
             let description =
                 vk::CommandBufferBeginInfo::default().flags(vk::CommandBufferUsageFlags::SIMULTANEOUS_USE);
             gpu.device.begin_command_buffer(commands, &description).map_err(|e| gpu.error(e))?;
+            let read_clock = |number: usize| {
+                if let Some(queries) = clock {
+                    let all_before = vk::PipelineStageFlags::BOTTOM_OF_PIPE;
+                    gpu.device.cmd_write_timestamp(commands, all_before, queries, number as u32);
+                }
+            };
+            if let Some(queries) = clock {
+                gpu.device.cmd_reset_query_pool(commands, queries, 0, self.launches.len() as u32 + 1);
+            }
             let compute = vk::PipelineBindPoint::COMPUTE;
-            for ((kernel, set), pipeline) in kernels.iter().zip(sets).zip(&self.pipelines) {
-                barrier(gpu, commands);
-                let layout = self.layouts[&kernel.bindings.len()].pipeline;
-                gpu.device.cmd_bind_pipeline(commands, compute, *pipeline);
-                gpu.device.cmd_bind_descriptor_sets(commands, compute, layout, 0, &[*set], &[]);
-                let [x, y, z] = kernel.workgroups;
-                gpu.device.cmd_dispatch(commands, x, y, z);
+            barrier(gpu, commands);
+            read_clock(0);
+            for (i, launch) in self.launches.iter().enumerate() {
+                for dispatch in &self.dispatches[launch.clone()] {
+                    gpu.device.cmd_bind_pipeline(commands, compute, dispatch.pipeline);
+                    let sets = [dispatch.set];
+                    gpu.device.cmd_bind_descriptor_sets(commands, compute, dispatch.layout, 0, &sets, &[]);
+                    let [x, y, z] = dispatch.workgroups;
+                    gpu.device.cmd_dispatch(commands, x, y, z);
+                    barrier(gpu, commands);
+                }
+                read_clock(i + 1);
             }
             gpu.device.end_command_buffer(commands).map_err(|e| gpu.error(e))?;
-            self.commands = commands;
+            Ok(commands)
         }
-        Ok(())
+    }
+}
+
+/// A program's dispatches once more, with the clock read between launches.
+pub(super) struct Timed<'l> {
+    pub commands: vk::CommandBuffer,
+    queries: vk::QueryPool,
+    clock: Clock,
+    loaded: &'l Loaded,
+}
+
+impl Timed<'_> {
+    pub fn new(loaded: &Loaded, clock: Clock) -> Result<Timed<'_>, RunError> {
+        let gpu = &loaded.gpu;
+        let description = vk::QueryPoolCreateInfo::default()
+            .query_type(vk::QueryType::TIMESTAMP)
+            .query_count(loaded.launches.len() as u32 + 1);
+        // SAFETY: handles of this device.
+        let queries = unsafe { gpu.device.create_query_pool(&description, None) }.map_err(|e| gpu.error(e))?;
+        let mut timed = Timed { commands: vk::CommandBuffer::null(), queries, clock, loaded };
+        timed.commands = loaded.record(Some(queries))?;
+        Ok(timed)
+    }
+
+    /// Seconds of every launch of a run that is done.
+    pub fn seconds(&self) -> Result<Vec<f64>, RunError> {
+        let gpu = &self.loaded.gpu;
+        let mut ticks = vec![0u64; self.loaded.launches.len() + 1];
+        let flags = vk::QueryResultFlags::TYPE_64 | vk::QueryResultFlags::WAIT;
+        // SAFETY: the queries were written by the run.
+        unsafe { gpu.device.get_query_pool_results(self.queries, 0, &mut ticks, flags).map_err(|e| gpu.error(e))? };
+        let between = |w: &[u64]| (w[1].wrapping_sub(w[0]) & self.clock.mask) as f64 * self.clock.seconds_per_tick;
+        Ok(ticks.windows(2).map(between).collect())
+    }
+}
+
+impl Drop for Timed<'_> {
+    fn drop(&mut self) {
+        let device = &self.loaded.gpu.device;
+        // SAFETY: the run was waited for, or never began.
+        unsafe {
+            if self.commands != vk::CommandBuffer::null() {
+                device.free_command_buffers(self.loaded.pool, &[self.commands]);
+            }
+            device.destroy_query_pool(self.queries, None);
+        }
     }
 }
 
@@ -200,7 +277,7 @@ impl Drop for Loaded {
         unsafe {
             device.destroy_command_pool(self.pool, None);
             device.destroy_descriptor_pool(self.descriptors, None);
-            self.pipelines.iter().for_each(|p| device.destroy_pipeline(*p, None));
+            self.dispatches.iter().for_each(|d| device.destroy_pipeline(d.pipeline, None));
             for layouts in self.layouts.values() {
                 device.destroy_pipeline_layout(layouts.pipeline, None);
                 device.destroy_descriptor_set_layout(layouts.set, None);

@@ -128,6 +128,13 @@ impl Queue {
         self.gpu.check()
     }
 
+    /// Submits a program and waits for it.
+    pub fn run(&mut self, program: vk::CommandBuffer) -> Result<(), RunError> {
+        let at = self.at;
+        self.submit(Some(program))?;
+        self.wait(at)
+    }
+
     /// Waits until a frame may be used again.
     fn wait(&mut self, at: usize) -> Result<(), RunError> {
         let (gpu, frame) = (&self.gpu, &mut self.frames[at]);

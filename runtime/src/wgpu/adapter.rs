@@ -43,6 +43,7 @@ impl Gpu {
         let limits = adapter.limits();
         let descriptor = api::DeviceDescriptor {
             label: Some("raygrad"),
+            required_features: adapter.features() & api::Features::TIMESTAMP_QUERY,
             required_limits: limits.clone(),
             memory_hints: api::MemoryHints::Performance,
             ..Default::default()
@@ -73,6 +74,11 @@ impl Gpu {
 
     pub fn adapter(&self) -> &Adapter {
         &self.adapter
+    }
+
+    /// Whether passes can read the device's clock.
+    pub(super) fn has_clock(&self) -> bool {
+        self.device.features().contains(api::Features::TIMESTAMP_QUERY)
     }
 
     pub(super) fn limits(&self) -> Limits {

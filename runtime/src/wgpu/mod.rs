@@ -68,6 +68,33 @@ impl Api for WgpuApi {
         self.gpu.check()
     }
 
+    fn profile(&mut self, program: &Loaded) -> Result<Option<Vec<f64>>, RunError> {
+        if !self.gpu.has_clock() {
+            return Ok(None);
+        }
+        let launches = program.launches();
+        let count = 2 * launches as u32;
+        if count > api::QUERY_SET_MAX_QUERIES {
+            return Ok(None);
+        }
+        let queries = self.gpu.device.create_query_set(&api::QuerySetDescriptor {
+            label: Some("clock"),
+            ty: api::QueryType::Timestamp,
+            count: count.max(1),
+        });
+        let ticks = self.gpu.device.create_buffer(&api::BufferDescriptor {
+            label: Some("clock"),
+            size: 8 * u64::from(count.max(1)),
+            usage: api::BufferUsages::QUERY_RESOLVE | api::BufferUsages::COPY_SRC,
+            mapped_at_creation: false,
+        });
+        program.submit_timed(&self.gpu, &queries, &ticks);
+        let halves = self.staging.read(&self.gpu, &ticks, 0, 4 * launches)?;
+        let tick = |i: usize| u64::from(halves[2 * i]) | u64::from(halves[2 * i + 1]) << 32;
+        let second = 1e-9 * f64::from(self.gpu.queue.get_timestamp_period());
+        Ok(Some((0..launches).map(|i| tick(2 * i + 1).wrapping_sub(tick(2 * i)) as f64 * second).collect()))
+    }
+
     fn read(&mut self, buffer: &api::Buffer, first: usize, lanes: usize) -> Result<Vec<u32>, RunError> {
         self.staging.read(&self.gpu, buffer, first, lanes)
     }

@@ -6,6 +6,7 @@ use crate::RunError;
 use crate::gpu::bound;
 use raygrad_kernels::gpu::{GpuLaunch, Kernel};
 use std::borrow::Cow;
+use std::ops::Range;
 
 struct Dispatch {
     pipeline: api::ComputePipeline,
@@ -15,6 +16,8 @@ struct Dispatch {
 
 pub(crate) struct Loaded {
     dispatches: Vec<Dispatch>,
+    /// Those of every launch.
+    launches: Vec<Range<usize>>,
 }
 
 impl Loaded {
@@ -24,9 +27,19 @@ impl Loaded {
         inputs: &[api::Buffer],
         own: &[api::Buffer],
     ) -> Result<Loaded, RunError> {
-        let kernels = launches.into_iter().flat_map(|l| l.kernels);
-        let dispatches = kernels.map(|k| Dispatch::new(gpu, k, inputs, own)).collect::<Result<_, _>>()?;
-        Ok(Loaded { dispatches })
+        let mut loaded = Loaded { dispatches: vec![], launches: vec![] };
+        for launch in launches {
+            let first = loaded.dispatches.len();
+            for kernel in launch.kernels {
+                loaded.dispatches.push(Dispatch::new(gpu, kernel, inputs, own)?);
+            }
+            loaded.launches.push(first..loaded.dispatches.len());
+        }
+        Ok(loaded)
+    }
+
+    pub fn launches(&self) -> usize {
+        self.launches.len()
     }
 
     /// Records and submits all dispatches.
@@ -34,18 +47,36 @@ impl Loaded {
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
         {
             let mut pass = encoder.begin_compute_pass(&Default::default());
-            for d in &self.dispatches {
-                pass.set_pipeline(&d.pipeline);
-                pass.set_bind_group(0, &d.bindings, &[]);
-                let [x, y, z] = d.workgroups;
-                pass.dispatch_workgroups(x, y, z);
-            }
+            self.dispatches.iter().for_each(|d| d.record(&mut pass));
         }
         gpu.queue.submit([encoder.finish()])
+    }
+
+    /// The same, a pass a launch; the clock is read at the begin and the end of each, two queries a launch.
+    pub fn submit_timed(&self, gpu: &Gpu, queries: &api::QuerySet, into: &api::Buffer) {
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        for (i, launch) in self.launches.iter().enumerate() {
+            let timestamp_writes = Some(api::ComputePassTimestampWrites {
+                query_set: queries,
+                beginning_of_pass_write_index: Some(2 * i as u32),
+                end_of_pass_write_index: Some(2 * i as u32 + 1),
+            });
+            let mut pass = encoder.begin_compute_pass(&api::ComputePassDescriptor { label: None, timestamp_writes });
+            self.dispatches[launch.clone()].iter().for_each(|d| d.record(&mut pass));
+        }
+        encoder.resolve_query_set(queries, 0..2 * self.launches.len() as u32, into, 0);
+        gpu.queue.submit([encoder.finish()]);
     }
 }
 
 impl Dispatch {
+    fn record(&self, pass: &mut api::ComputePass) {
+        pass.set_pipeline(&self.pipeline);
+        pass.set_bind_group(0, &self.bindings, &[]);
+        let [x, y, z] = self.workgroups;
+        pass.dispatch_workgroups(x, y, z);
+    }
+
     fn new(gpu: &Gpu, kernel: Kernel, inputs: &[api::Buffer], own: &[api::Buffer]) -> Result<Dispatch, RunError> {
         let name = kernel.name;
         let label = Some(&*name);

@@ -1,10 +1,15 @@
-//! `raygrad bench`: how long a training step takes, against what the machine could do at best.
+//! `raygrad bench`: how long a training step takes, launch by launch, against what the device could do at best.
 
 use crate::Choice;
 use clap::Args;
 use raygrad::config::{ConfigError, Count};
+use raygrad::training::Training;
+use raygrad_compiler::Program;
 use raygrad_kernels::cpu::peak::peak_gflops;
+use raygrad_runtime::{Ceilings, Device};
 use serde::Serialize;
+use serde_json::json;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
 
@@ -15,6 +20,12 @@ pub struct BenchArgs {
     /// Steps to time, after three that are not; by default as many as take about five seconds, at least ten.
     #[arg(long, value_name = "N")]
     steps: Option<usize>,
+    /// Also say what every launch takes, by the device's clock, against the device's ceilings.
+    #[arg(long)]
+    launches: bool,
+    /// Write the launches of a few steps as a trace for Perfetto (ui.perfetto.dev) or chrome://tracing.
+    #[arg(long, value_name = "FILE")]
+    trace: Option<PathBuf>,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
@@ -34,14 +45,32 @@ struct Result {
     /// Six operations a weight and row.
     gflop_per_step: f64,
     gflops: f64,
-    /// Fused multiply-adds from registers on as many threads, measured in this run.
+    /// Multiply-adds from registers, on as many threads, measured in this run.
     peak_gflops: f64,
     peak_rss_mb: f64,
+    /// With `--launches`: 10^9 bytes a second to and from memory, measured in this run.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    peak_gbytes: Option<f64>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    per_launch: Vec<Launch>,
+}
+
+/// A launch of a step.
+#[derive(Serialize)]
+struct Launch {
+    name: String,
+    /// Median over the profiled steps, by the device's clock.
+    seconds: f64,
+    /// Of what it computes, and of every buffer it touches, once.
+    gflop: f64,
+    gbytes: f64,
 }
 
 const WARM_UP: usize = 3;
 const SECONDS: f64 = 5.0;
 const LEAST: usize = 10;
+/// Steps whose launches are timed.
+const PROFILED: usize = 7;
 
 pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
     let mut experiment = args.choice.experiment()?;
@@ -60,8 +89,10 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
         trainer.step()?;
         trainer.wait()?;
     }
-    // Half of the peak before the steps and half after: the clock may change in between.
-    let mut peak = peak_gflops(threads, 150.0);
+    let device = trainer.learner().device().clone();
+    let on_cpu = matches!(device, Device::Cpu { .. });
+    // On a CPU the peak is looked at before the steps and after: the clock may change in between.
+    let mut peak = if on_cpu { peak_gflops(threads, 150.0) } else { 0.0 };
     let begun = Instant::now();
     let mut times = vec![];
     while args.steps.map_or(times.len() < LEAST || begun.elapsed().as_secs_f64() < SECONDS, |n| times.len() < n) {
@@ -70,9 +101,20 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
         trainer.wait()?;
         times.push(step.elapsed().as_secs_f64());
     }
-    peak = peak.max(peak_gflops(threads, 150.0));
-    times.sort_by(f64::total_cmp);
-    let seconds = times[times.len() / 2];
+    if on_cpu {
+        peak = peak.max(peak_gflops(threads, 150.0));
+    }
+    let wants_launches = args.launches || args.trace.is_some();
+    let ceilings = if wants_launches || !on_cpu { Some(device.ceilings()?) } else { None };
+    if let Some(ceilings) = ceilings.filter(|_| !on_cpu) {
+        peak = ceilings.gflops;
+    }
+    let profiled = if wants_launches { profile(&mut *trainer)? } else { vec![] };
+    let program = trainer.learner().program(trainer.training_program());
+    if let Some(file) = &args.trace {
+        write_trace(file, program, &profiled)?;
+    }
+    let seconds = median(&mut times);
     let gflop = trainer.flops() / 1e9;
     let result = Result {
         preset: args.choice.preset.clone(),
@@ -86,6 +128,8 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
         gflops: gflop / seconds,
         peak_gflops: peak,
         peak_rss_mb: peak_rss_mb(),
+        peak_gbytes: ceilings.filter(|_| args.launches).map(|c| c.gbytes),
+        per_launch: if args.launches { launches(program, &profiled) } else { vec![] },
     };
     if args.json {
         println!("{}", serde_json::to_string(&result)?);
@@ -95,7 +139,90 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
     println!("step      {:.2} ms (median of {}), {} launches", 1e3 * seconds, result.steps, result.launches);
     println!("rate      {:.1} GFLOP/s of {:.1} ({:.0} %)", result.gflops, peak, 100.0 * result.gflops / peak);
     println!("memory    {:.0} MB at most", result.peak_rss_mb);
+    if let (true, Some(ceilings)) = (args.launches, ceilings) {
+        print_launches(&result.per_launch, ceilings);
+    }
     Ok(ExitCode::SUCCESS)
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied().unwrap_or(0.0)
+}
+
+/// Seconds of every launch of some steps.
+fn profile(trainer: &mut dyn Training) -> anyhow::Result<Vec<Vec<f64>>> {
+    let program = trainer.training_program();
+    let learner = trainer.learner_mut();
+    let mut steps = vec![];
+    // The first one may have to make what reads the clock.
+    for _ in 0..=PROFILED {
+        match learner.profile(program)? {
+            Some(seconds) => steps.push(seconds),
+            None => anyhow::bail!("{} has no clock for launches", learner.device_name()),
+        }
+    }
+    steps.remove(0);
+    Ok(steps)
+}
+
+fn launches(program: &Program, profiled: &[Vec<f64>]) -> Vec<Launch> {
+    let one = |(i, launch): (usize, &raygrad_compiler::plan::Launch)| Launch {
+        name: launch.name.clone(),
+        seconds: median(&mut profiled.iter().map(|step| step[i]).collect::<Vec<_>>()),
+        gflop: launch.region.flops() as f64 * 1e-9,
+        gbytes: program.launch_bytes(i) as f64 * 1e-9,
+    };
+    program.launches.iter().enumerate().map(one).collect()
+}
+
+/// A line a launch: its share of the step, and its rates, absolute and in per cent of the ceilings.
+fn print_launches(launches: &[Launch], ceilings: Ceilings) {
+    let total: f64 = launches.iter().map(|l| l.seconds).sum();
+    let width = launches.iter().map(|l| l.name.len()).max().unwrap_or(0).max(6);
+    println!("\n{:width$}  {:>9}  {:>6}  {:>16}  {:>14}", "launch", "ms", "share", "GFLOP/s", "GB/s");
+    for l in launches {
+        let (flops, bytes) = (l.gflop / l.seconds.max(1e-9), l.gbytes / l.seconds.max(1e-9));
+        println!(
+            "{:width$}  {:>9.3}  {:>4.0} %  {:>9.1} ({:>2.0} %)  {:>7.1} ({:>2.0} %)",
+            l.name,
+            1e3 * l.seconds,
+            100.0 * l.seconds / total,
+            flops,
+            100.0 * flops / ceilings.gflops,
+            bytes,
+            100.0 * bytes / ceilings.gbytes,
+        );
+    }
+    println!(
+        "{:width$}  {:>9.3}          {:>9.1} at best   {:>7.1} at best",
+        "all",
+        1e3 * total,
+        ceilings.gflops,
+        ceilings.gbytes
+    );
+}
+
+/// Complete events of the trace event format (times in microseconds), the steps one after the other.
+fn write_trace(file: &Path, program: &Program, profiled: &[Vec<f64>]) -> anyhow::Result<()> {
+    let mut events = vec![];
+    let mut at = 0.0;
+    for (number, step) in profiled.iter().enumerate() {
+        let length: f64 = step.iter().sum();
+        let name = format!("step {}", number + 1);
+        events.push(json!({ "name": name, "ph": "X", "pid": 1, "tid": 1, "ts": at * 1e6, "dur": length * 1e6 }));
+        for (i, (launch, seconds)) in program.launches.iter().zip(step).enumerate() {
+            let megaflop = launch.region.flops() as f64 * 1e-6;
+            let megabytes = program.launch_bytes(i) as f64 * 1e-6;
+            events.push(json!({
+                "name": launch.name, "ph": "X", "pid": 1, "tid": 1, "ts": at * 1e6, "dur": seconds * 1e6,
+                "args": { "MFLOP": megaflop, "MB": megabytes },
+            }));
+            at += seconds;
+        }
+    }
+    let text = serde_json::to_string(&json!({ "traceEvents": events, "displayTimeUnit": "ms" }))?;
+    std::fs::write(file, text).map_err(|e| anyhow::anyhow!("cannot write {}: {e}", file.display()))
 }
 
 /// Largest resident set of this process so far, in 10^6 bytes; 0 where the system does not tell.
