@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Runs every check of the repository: format, lints, tests on both backends, doc tests, documented commands.
-# Where no Vulkan driver is found it installs a software one (lavapipe) through apt.
+# Runs every check of the repository: format, lints, tests on all backends, doc tests, documented commands.
+# Where no Vulkan driver is found it installs a software one (lavapipe) through apt, and so the validation layer.
 #
 # usage: scripts/test.sh [--nightly]    --nightly adds the tests that take minutes each
 #
@@ -38,11 +38,17 @@ has() { "$@" >/dev/null 2>&1; }
 
 as_root() { if [ "$(id -u)" = 0 ]; then "$@"; else sudo "$@"; fi; }
 
-install_lavapipe() {
+install_driver() {
     has apt-get --version || { echo "no Vulkan driver and no apt-get to install one" >&2; return 1; }
     as_root apt-get update -q &&
         as_root env DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends \
             libvulkan1 mesa-vulkan-drivers
+}
+
+install_validation() {
+    has apt-get --version || { echo "no apt-get to install the Vulkan validation layer" >&2; return 1; }
+    as_root apt-get update -q &&
+        as_root env DEBIAN_FRONTEND=noninteractive apt-get install -qy --no-install-recommends vulkan-validationlayers
 }
 
 target=${CARGO_TARGET_DIR:-target}
@@ -60,7 +66,14 @@ fi
 if has cargo deny --version; then check dependencies cargo deny --offline check bans licenses sources; fi
 
 check build cargo test --workspace --no-run --quiet
-if ! "$raygrad" devices 2>/dev/null | grep -q '^wgpu'; then check "software Vulkan driver" install_lavapipe; fi
+if ! "$raygrad" devices 2>/dev/null | grep -q '^wgpu'; then check "software Vulkan driver" install_driver; fi
+# What the validation layer says about the Vulkan backend is an error. Without the layer there are no Vulkan adapters.
+export RAYGRAD_VULKAN_VALIDATION=1
+validates() { "$raygrad" devices 2>/dev/null | grep -q '^vulkan'; }
+if ! validates && ! { install_validation && validates; }; then
+    export RAYGRAD_VULKAN_VALIDATION=0
+    skip "Vulkan validation" "VK_LAYER_KHRONOS_validation is not installed and cannot be"
+fi
 
 if has cargo nextest --version; then
     run=(cargo nextest run --workspace --no-fail-fast --cargo-quiet --status-level fail --final-status-level slow)

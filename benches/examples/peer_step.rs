@@ -3,9 +3,8 @@
 //!
 //! Speeds on a shared machine drift: every number is a median over rounds, and every ratio is taken within a round first.
 
-use anyhow::{Context, bail};
 use clap::{Parser, ValueEnum};
-use raygrad_benches::{Table, median, quick};
+use raygrad_benches::{Table, median, number_before, output, quick};
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -164,12 +163,7 @@ impl Args {
             command.args(["--threads", &self.threads.to_string()]);
         }
         let text = output(command)?;
-        let words: Vec<&str> = text.split_whitespace().collect();
-        let before = |unit: &str| -> anyhow::Result<f64> {
-            let at = words.iter().position(|w| *w == unit).filter(|at| *at > 0);
-            let word = words[at.with_context(|| format!("no `{unit}` in `{text}`"))? - 1];
-            word.parse().with_context(|| format!("`{word}` is no number"))
-        };
+        let before = |unit| number_before(&text, unit);
         Ok(Timed { seconds: before("s/step")?, gflop: before("GFLOP/step")?, rss_mb: before("MB")? })
     }
 
@@ -212,12 +206,4 @@ impl Args {
         }
         println!("{table}");
     }
-}
-
-fn output(mut command: Command) -> anyhow::Result<String> {
-    let done = command.output().with_context(|| format!("cannot start {command:?}"))?;
-    if !done.status.success() {
-        bail!("{command:?} failed: {}", String::from_utf8_lossy(&done.stderr));
-    }
-    Ok(String::from_utf8(done.stdout)?)
 }

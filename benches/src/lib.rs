@@ -2,11 +2,13 @@
 //!
 //! The measurements are examples, run by the scripts beside this crate.
 
+use anyhow::{Context, bail};
 use raygrad::Experiment;
 use raygrad::planar::Trainer;
 use raygrad::training::Training;
 use std::fmt::Display;
 use std::io::IsTerminal;
+use std::process::Command;
 use std::time::Instant;
 
 /// Median; NaN of nothing.
@@ -47,6 +49,23 @@ impl Display for Table {
         }
         Ok(())
     }
+}
+
+/// What a program prints; its messages, if it fails.
+pub fn output(mut command: Command) -> anyhow::Result<String> {
+    let done = command.output().with_context(|| format!("cannot start {command:?}"))?;
+    if !done.status.success() {
+        bail!("{command:?} failed: {}", String::from_utf8_lossy(&done.stderr));
+    }
+    Ok(String::from_utf8(done.stdout)?)
+}
+
+/// The number that stands before a unit.
+pub fn number_before(text: &str, unit: &str) -> anyhow::Result<f64> {
+    let words: Vec<&str> = text.split_whitespace().collect();
+    let at = words.iter().position(|w| *w == unit).filter(|at| *at > 0);
+    let word = words[at.with_context(|| format!("no `{unit}` in `{text}`"))? - 1];
+    word.parse().with_context(|| format!("`{word}` is no number"))
 }
 
 /// Whether scripts only prove that they run (`RAYGRAD_QUICK`).

@@ -62,6 +62,10 @@ pub enum Error {
     Run(#[from] RunError),
     #[error("`{what}` is not finite after step {step}; the last checkpoint is unharmed")]
     NotFinite { what: String, step: usize },
+    #[error(
+        "{source}\nthe run is kept as it was after step {step}; continue with the same command and `--out {folder} --resume`"
+    )]
+    DeviceFailed { source: RunError, step: usize, folder: String },
 }
 
 impl Error {
@@ -79,6 +83,7 @@ impl Error {
             | Error::Plot(_)
             | Error::Compile(_)
             | Error::Run(_)
+            | Error::DeviceFailed { .. }
             | Error::NotFinite { .. } => false,
             _ => true,
         }

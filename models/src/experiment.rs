@@ -243,9 +243,10 @@ impl Experiment {
             false => RunFolder::claim(&path, settings)?,
         };
         let mut trainer = self.training_after(&*observer.loading())?;
-        let mut run = Run { metrics: Metrics::default(), seconds: 0.0, begun: Instant::now() };
+        let mut run = Run { metrics: Metrics::default(), seconds: 0.0, begun: Instant::now(), kept: None };
         if self.resume {
             let checkpoint = self.restore(&mut *trainer)?;
+            run.kept = Some(checkpoint.step);
             (run.metrics.steps, run.seconds) = (checkpoint.steps, checkpoint.seconds);
         } else {
             folder.start(settings)?;
@@ -262,7 +263,7 @@ impl Experiment {
         let interrupted = self.run_steps(&mut run, &mut *trainer, &folder, observer, stop)?;
         if !interrupted {
             observer.finishing();
-            let Run { metrics, seconds, begun } = &mut run;
+            let Run { metrics, seconds, begun, .. } = &mut run;
             let elapsed = || *seconds + begun.elapsed().as_secs_f64();
             trainer.finish(&folder, &self.layered, metrics, &elapsed)?;
         }
@@ -271,8 +272,25 @@ impl Experiment {
         Ok(Outcome { metrics: run.metrics, folder: path, interrupted, summary })
     }
 
-    /// The steps that are left; whether they were cut short.
+    /// The steps that are left; whether they were cut short. A device that is lost takes with it what was learnt since the
+    /// last checkpoint, and the error says how to go on from there.
     fn run_steps(
+        &self,
+        run: &mut Run,
+        trainer: &mut dyn Training,
+        folder: &RunFolder,
+        observer: &mut dyn Observer,
+        stop: &AtomicBool,
+    ) -> Result<bool, Error> {
+        self.steps_left(run, trainer, folder, observer, stop).map_err(|error| match (error, run.kept) {
+            (Error::Run(source), Some(step)) => {
+                Error::DeviceFailed { source, step, folder: folder.path().display().to_string() }
+            }
+            (other, _) => other,
+        })
+    }
+
+    fn steps_left(
         &self,
         run: &mut Run,
         trainer: &mut dyn Training,
@@ -309,6 +327,10 @@ impl Experiment {
     }
 }
 
+#[cfg(test)]
+#[path = "experiment_tests.rs"]
+mod tests;
+
 /// Runs of fewer steps are not timed before they begin.
 const TRIED: usize = 50;
 /// Steps that are timed, or fewer if they take longer than so many seconds.
@@ -342,15 +364,18 @@ struct Run {
     /// Time of the parts before this one.
     seconds: f64,
     begun: Instant,
+    /// Steps of the last checkpoint.
+    kept: Option<usize>,
 }
 
 impl Run {
     fn elapsed(&self) -> f64 {
         self.seconds + self.begun.elapsed().as_secs_f64()
     }
-    fn checkpoint(&self, trainer: &mut dyn Training, folder: &RunFolder) -> Result<(), Error> {
+    fn checkpoint(&mut self, trainer: &mut dyn Training, folder: &RunFolder) -> Result<(), Error> {
         let (step, seconds, steps) = (trainer.steps_done(), self.elapsed(), self.metrics.steps.clone());
         Checkpoint { step, seconds, steps, tensors: trainer.tensors()? }.save(folder.path())?;
+        self.kept = Some(step);
         Ok(())
     }
 }

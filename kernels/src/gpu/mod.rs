@@ -117,6 +117,13 @@ impl Kernel {
         spv::write_vec(&self.module, &self.info, &options, None).map_err(|e| self.write_error(&e))
     }
 
+    /// Memory that a workgroup shares.
+    pub fn workgroup_bytes(&self) -> u32 {
+        let module = &self.module;
+        let shared = module.global_variables.iter().filter(|(_, v)| v.space == naga::AddressSpace::WorkGroup);
+        shared.map(|(_, v)| module.types[v.ty].inner.size(module.to_ctx())).sum()
+    }
+
     fn write_error(&self, e: &dyn std::fmt::Display) -> LowerError {
         LowerError::Write { kernel: self.name.clone(), message: e.to_string() }
     }

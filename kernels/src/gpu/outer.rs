@@ -35,7 +35,7 @@ pub(super) fn kernels(
     let over = region.domain.minus(&keep);
     let (inputs, outputs) = (region.inst(*x).channels, region.inst(*d).channels);
     let (rows, kept) = (over.elements(), keep.elements());
-    let tile = Tile { k: 16, ..Tile::of(outputs, 16) };
+    let tile = Tile::of(outputs, rows);
     let tiles = inputs.div_ceil(tile.m as usize) * outputs.div_ceil(tile.n as usize) * kept;
     let wanted = ENOUGH.div_ceil(tiles).min(rows.div_ceil(CHUNK_ROWS)).min(MAX_CHUNKS);
     let per_chunk = rows.div_ceil(wanted).next_multiple_of(tile.k as usize);

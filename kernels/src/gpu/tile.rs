@@ -25,6 +25,8 @@ impl Tile {
         let deep = match k {
             0..=4 => 4,
             5..=8 => 8,
+            // A deeper tile of 256 rows would not fit into the 16 KiB that WebGPU guarantees.
+            _ if n <= 4 => 8,
             _ => 16,
         };
         let (m, n, own_m, own_n) = match n {

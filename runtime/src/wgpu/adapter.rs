@@ -1,6 +1,7 @@
 //! Adapters and the device opened on one.
 
 use super::api;
+use crate::gpu::cache::CacheFile;
 use crate::gpu::{Adapter, AdapterKind, bytes, choose, device_error};
 use crate::{DeviceError, RunError};
 use raygrad_kernels::gpu::{Arena, Limits};
@@ -15,6 +16,8 @@ pub struct Gpu {
     pub(super) queue: api::Queue,
     adapter: Adapter,
     limits: Limits,
+    /// Compiled pipelines, where the API lets them out.
+    cache: Option<(CacheFile, api::PipelineCache)>,
     /// The first error nobody was asked about: wgpu reports most of them late.
     failed: Arc<Mutex<Option<String>>>,
 }
@@ -43,7 +46,7 @@ impl Gpu {
         let limits = adapter.limits();
         let descriptor = api::DeviceDescriptor {
             label: Some("raygrad"),
-            required_features: adapter.features() & api::Features::TIMESTAMP_QUERY,
+            required_features: adapter.features() & (api::Features::TIMESTAMP_QUERY | api::Features::PIPELINE_CACHE),
             required_limits: limits.clone(),
             memory_hints: api::MemoryHints::Performance,
             ..Default::default()
@@ -69,7 +72,18 @@ impl Gpu {
             max_binding: limits.max_storage_buffer_binding_size.min(limits.max_buffer_size),
             max_workgroups: limits.max_compute_workgroups_per_dimension,
         };
-        Ok(Gpu { device, queue, adapter: info, limits, failed })
+        let key = api::util::pipeline_cache_key(&adapter.get_info());
+        let cache = key.filter(|_| device.features().contains(api::Features::PIPELINE_CACHE)).map(|key| {
+            let (file, known) = CacheFile::open(&key);
+            let description = api::PipelineCacheDescriptor {
+                label: Some("raygrad"),
+                data: (!known.is_empty()).then_some(&known),
+                fallback: true,
+            };
+            // SAFETY: the data came out of such a cache (a hash says so), and wgpu refuses those of another driver.
+            (file, unsafe { device.create_pipeline_cache(&description) })
+        });
+        Ok(Gpu { device, queue, adapter: info, limits, cache, failed })
     }
 
     pub fn adapter(&self) -> &Adapter {
@@ -79,6 +93,10 @@ impl Gpu {
     /// Whether passes can read the device's clock.
     pub(super) fn has_clock(&self) -> bool {
         self.device.features().contains(api::Features::TIMESTAMP_QUERY)
+    }
+
+    pub(super) fn cache(&self) -> Option<&api::PipelineCache> {
+        self.cache.as_ref().map(|(_, cache)| cache)
     }
 
     pub(super) fn limits(&self) -> Limits {
@@ -119,6 +137,16 @@ impl Gpu {
             other => other,
         })?;
         Ok(buffer)
+    }
+}
+
+impl Drop for Gpu {
+    fn drop(&mut self) {
+        if let Some((file, cache)) = &self.cache
+            && let Some(pipelines) = cache.get_data()
+        {
+            file.save(&pipelines);
+        }
     }
 }
 

@@ -130,7 +130,7 @@ impl Dispatch {
                 zero_initialize_workgroup_memory: false,
                 ..Default::default()
             },
-            cache: None,
+            cache: gpu.cache(),
         });
         gpu.check().map_err(|e| match e {
             RunError::Device { device, problem } => {

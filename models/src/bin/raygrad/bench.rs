@@ -48,6 +48,9 @@ struct Result {
     /// Multiply-adds from registers, on as many threads, measured in this run.
     peak_gflops: f64,
     peak_rss_mb: f64,
+    /// Median time of the host for a step that it does not wait for; where it computes itself, there is none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    host_seconds_per_step: Option<f64>,
     /// With `--launches`: 10^9 bytes a second to and from memory, measured in this run.
     #[serde(skip_serializing_if = "Option::is_none")]
     peak_gbytes: Option<f64>,
@@ -69,6 +72,8 @@ struct Launch {
 const WARM_UP: usize = 3;
 const SECONDS: f64 = 5.0;
 const LEAST: usize = 10;
+/// Steps that the host runs ahead.
+const AHEAD: usize = 2;
 /// Steps whose launches are timed.
 const PROFILED: usize = 7;
 
@@ -101,6 +106,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
         trainer.wait()?;
         times.push(step.elapsed().as_secs_f64());
     }
+    let host = if on_cpu { None } else { Some(host_seconds(&mut *trainer)?) };
     if on_cpu {
         peak = peak.max(peak_gflops(threads, 150.0));
     }
@@ -128,6 +134,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
         gflops: gflop / seconds,
         peak_gflops: peak,
         peak_rss_mb: peak_rss_mb(),
+        host_seconds_per_step: host,
         peak_gbytes: ceilings.filter(|_| args.launches).map(|c| c.gbytes),
         per_launch: if args.launches { launches(program, &profiled) } else { vec![] },
     };
@@ -139,10 +146,27 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
     println!("step      {:.2} ms (median of {}), {} launches", 1e3 * seconds, result.steps, result.launches);
     println!("rate      {:.1} GFLOP/s of {:.1} ({:.0} %)", result.gflops, peak, 100.0 * result.gflops / peak);
     println!("memory    {:.0} MB at most", result.peak_rss_mb);
+    if let Some(host) = result.host_seconds_per_step {
+        println!("host      {:.0} us a step, beside the device", 1e6 * host);
+    }
     if let (true, Some(ceilings)) = (args.launches, ceilings) {
         print_launches(&result.per_launch, ceilings);
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// Seconds that the host is busy with a step, a few of which it may leave to the device without waiting.
+fn host_seconds(trainer: &mut dyn Training) -> anyhow::Result<f64> {
+    let mut times = vec![];
+    for _ in 0..PROFILED {
+        for _ in 0..AHEAD {
+            let begun = Instant::now();
+            trainer.step()?;
+            times.push(begun.elapsed().as_secs_f64());
+        }
+        trainer.wait()?;
+    }
+    Ok(median(&mut times))
 }
 
 fn median(values: &mut [f64]) -> f64 {

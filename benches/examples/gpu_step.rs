@@ -1,0 +1,239 @@
+//! Training steps at the papers' sizes on this machine's GPU: raygrad through wgpu and Vulkan against PyTorch on the same
+//! device, alternating in one run, and against the rates that the device reaches at best. Writes one Markdown file.
+//!
+//! Every number is a median over rounds. PyTorch runs f32 with TF32 off, which is its default.
+
+use anyhow::Context;
+use clap::Parser;
+use raygrad_benches::{Table, median, number_before, output, quick};
+use serde::Deserialize;
+use std::collections::BTreeMap;
+use std::fmt::Write;
+use std::path::PathBuf;
+use std::process::Command;
+
+#[derive(Parser)]
+struct Args {
+    /// The command raygrad.
+    #[arg(long)]
+    raygrad: PathBuf,
+    /// Python with torch; where it or its GPU is missing, it is left out.
+    #[arg(long)]
+    python: PathBuf,
+    /// Folder of torch_step.py.
+    #[arg(long)]
+    peers: PathBuf,
+    /// Folder of the result, `<device>.md`.
+    #[arg(long)]
+    out: PathBuf,
+    #[arg(long, default_value_t = 3)]
+    rounds: usize,
+    /// What `raygrad --device` takes.
+    #[arg(long, default_value = "wgpu,vulkan", value_delimiter = ',')]
+    devices: Vec<String>,
+    /// A share of the papers' sizes, where the device is slow or small.
+    #[arg(long, default_value_t = 1.0)]
+    scale: f64,
+}
+
+/// A step that raygrad and PyTorch take.
+struct Work {
+    preset: &'static str,
+    title: &'static str,
+    setting: &'static str,
+    rows: f64,
+    /// Name and size in torch_step.py.
+    peer: [&'static str; 2],
+    /// Steps of the paper's run.
+    steps: f64,
+}
+
+const WORKS: [Work; 2] = [
+    Work {
+        preset: "planar-l2g",
+        title: "planar L2G, 5 patches x points",
+        setting: "data.points_per_patch",
+        rows: 32400.0,
+        peer: ["planar", "--pixels"],
+        steps: 5000.0,
+    },
+    Work {
+        preset: "l2g-blender",
+        title: "L2G in space, rays x 128 samples, 8 x 256",
+        setting: "train.rays",
+        rows: 1024.0,
+        peer: ["l2g", "--rays"],
+        steps: 200_000.0,
+    },
+];
+
+/// How PyTorch runs.
+const PEERS: [(&str, &[&str]); 5] = [
+    ("PyTorch f32", &[]),
+    ("PyTorch f32, compiled", &["--compile"]),
+    ("PyTorch bf16", &["--dtype", "bf16"]),
+    ("PyTorch bf16, compiled", &["--dtype", "bf16", "--compile"]),
+    ("PyTorch f16, compiled", &["--dtype", "f16", "--compile"]),
+];
+
+/// What `raygrad bench --json --launches` prints.
+#[derive(Deserialize)]
+struct Bench {
+    device: String,
+    rows: usize,
+    launches: usize,
+    seconds_per_step: f64,
+    gflop_per_step: f64,
+    peak_gflops: f64,
+    peak_gbytes: f64,
+    host_seconds_per_step: f64,
+    per_launch: Vec<Launch>,
+}
+
+#[derive(Deserialize)]
+struct Launch {
+    name: String,
+    seconds: f64,
+    gflop: f64,
+    gbytes: f64,
+}
+
+fn main() -> anyhow::Result<()> {
+    let mut args = Args::parse();
+    if quick() {
+        (args.rounds, args.devices) = (1, vec!["vulkan".into()]);
+    }
+    let peers = if args.has_cuda() { &PEERS[..] } else { &[] };
+    let (mut text, mut device) = (String::new(), String::new());
+    for work in &WORKS {
+        let mut own: BTreeMap<&str, Vec<Bench>> = BTreeMap::new();
+        let mut others: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
+        for round in 1..=args.rounds {
+            for name in &args.devices {
+                let bench = args.own(work, name)?;
+                eprintln!("round {round}: {} on {name} {:.4} s", work.preset, bench.seconds_per_step);
+                own.entry(name).or_default().push(bench);
+            }
+            let rows = own.values().flatten().last().map_or(0, |b| b.rows);
+            for (name, options) in peers {
+                let seconds = args.peer(work, rows, options)?;
+                eprintln!("round {round}: {} in {name} {seconds:.4} s", work.preset);
+                others.entry(name).or_default().push(seconds);
+            }
+        }
+        device = own.values().flatten().last().map(|b| b.device.clone()).context("no device was asked for")?;
+        report(&mut text, work, &own, &others)?;
+    }
+    let name: String = device.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect();
+    let file = args.out.join(format!("{}.md", name.trim_matches('-')));
+    let head =
+        format!("# {device}\n\n`benches/gpu.sh --rounds {} --scale {}`, f32, medians.\n", args.rounds, args.scale);
+    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
+    std::fs::write(&file, head + &text).with_context(|| format!("cannot write {}", file.display()))?;
+    print!("{text}");
+    println!("written to {}", file.display());
+    Ok(())
+}
+
+impl Args {
+    fn has_cuda(&self) -> bool {
+        let code = "import torch, sys; sys.exit(not torch.cuda.is_available())";
+        let there = Command::new(&self.python).args(["-c", code]).output().is_ok_and(|o| o.status.success());
+        if !there {
+            eprintln!("PyTorch is left out: {} finds none with a GPU", self.python.display());
+        }
+        there
+    }
+
+    fn own(&self, work: &Work, device: &str) -> anyhow::Result<Bench> {
+        let rows = if quick() { 64.0 } else { (work.rows * self.scale).round() };
+        let mut command = Command::new(&self.raygrad);
+        command.args(["bench", work.preset, "--json", "--launches", "--device", device]);
+        command.args(["--set", &format!("{}={rows}", work.setting)]);
+        if quick() {
+            command.args(["--steps", "1", "--set", "field.layers=[16,16]", "--set", "field.skip=[]"]);
+            command.args(["--set", "warp.layers=[16,16]", "--set", "warp.skip=[]"]);
+            if work.preset == "l2g-blender" {
+                command.args(["--set", "scene.image_size=[16,16]", "--set", "scene.train_views=4"]);
+                command.args(["--set", "radiance.skip=[]", "--set", "train.samples=8"]);
+            }
+        }
+        Ok(serde_json::from_str(&output(command)?)?)
+    }
+
+    /// Seconds of a step in PyTorch, on as many points of a patch, or rays.
+    fn peer(&self, work: &Work, rows: usize, options: &[&str]) -> anyhow::Result<f64> {
+        let mut command = Command::new(&self.python);
+        command.arg(self.peers.join("torch_step.py")).args(work.peer).arg(rows.to_string());
+        command.args(["--device", "cuda", "--iters", "20"]).args(options);
+        number_before(&output(command)?, "s/step")
+    }
+}
+
+fn report(
+    text: &mut String,
+    work: &Work,
+    own: &BTreeMap<&str, Vec<Bench>>,
+    others: &BTreeMap<&str, Vec<f64>>,
+) -> std::fmt::Result {
+    let of = |runs: &[Bench], f: fn(&Bench) -> f64| median(&runs.iter().map(f).collect::<Vec<_>>());
+    let all: Vec<&Bench> = own.values().flatten().collect();
+    let Some(last) = all.last() else { return Ok(()) };
+    let best = |f: fn(&Bench) -> f64| median(&all.iter().map(|b| f(b)).collect::<Vec<_>>());
+    let (peak, bytes) = (best(|b| b.peak_gflops), best(|b| b.peak_gbytes));
+    writeln!(text, "\n## {} ({} rows)\n", work.title, last.rows)?;
+    writeln!(
+        text,
+        "At best: {peak:.0} GFLOP/s of f32 multiply-adds, {bytes:.0} GB/s of memory, both measured here.\n"
+    )?;
+    let hours = format!("{:.0} steps, min", work.steps);
+    let mut table = Table::new(&["program", "ms a step", "GFLOP/s", "of f32 at best", "host, us", &hours]);
+    let mut row = |name: String, seconds: f64, host: Option<f64>| {
+        let rate = last.gflop_per_step / seconds;
+        table.row([
+            name,
+            format!("{:.2}", 1e3 * seconds),
+            format!("{rate:.0}"),
+            format!("{:.0} %", 100.0 * rate / peak),
+            host.map_or(String::new(), |s| format!("{:.0}", 1e6 * s)),
+            format!("{:.1}", seconds * work.steps / 60.0),
+        ]);
+    };
+    for (device, runs) in own {
+        let host = of(runs, |b| b.host_seconds_per_step);
+        row(format!("raygrad, {device}"), of(runs, |b| b.seconds_per_step), Some(host));
+    }
+    for (name, runs) in others {
+        row(name.to_string(), median(runs), None);
+    }
+    write!(text, "{table}")?;
+    for (device, runs) in own {
+        launches(text, device, &runs[runs.len() - 1], peak, bytes)?;
+    }
+    Ok(())
+}
+
+/// The launches that take most of a step.
+fn launches(text: &mut String, device: &str, bench: &Bench, peak: f64, bytes: f64) -> std::fmt::Result {
+    const SHOWN: usize = 12;
+    let total: f64 = bench.per_launch.iter().map(|l| l.seconds).sum();
+    let mut slowest: Vec<&Launch> = bench.per_launch.iter().collect();
+    slowest.sort_by(|a, b| b.seconds.total_cmp(&a.seconds));
+    writeln!(
+        text,
+        "\n{device}: {} launches, {:.2} ms by the device's clock; the slowest\n",
+        bench.launches,
+        1e3 * total
+    )?;
+    let mut table = Table::new(&["launch", "ms", "share", "of f32 at best", "of memory at best"]);
+    for l in slowest.into_iter().take(SHOWN) {
+        table.row([
+            l.name.clone(),
+            format!("{:.3}", 1e3 * l.seconds),
+            format!("{:.0} %", 100.0 * l.seconds / total),
+            format!("{:.0} %", 100.0 * l.gflop / l.seconds / peak),
+            format!("{:.0} %", 100.0 * l.gbytes / l.seconds / bytes),
+        ]);
+    }
+    write!(text, "{table}")
+}

@@ -1,0 +1,73 @@
+//! Kernels within what WebGPU guarantees, so that browsers and phones can run them.
+#![cfg(feature = "gpu")]
+
+use raygrad::config::Layered;
+use raygrad::radiance::RadianceModel;
+use raygrad::radiance::rays::ImageSize;
+use raygrad::warps;
+use raygrad_compiler::{Step, Target, compile};
+use raygrad_kernels::gpu::{Inputs, Kernel, Limits, lower};
+use raygrad_tests::forms::forms;
+use raygrad_tests::planar::Planar;
+
+/// Of a kernel at most, by the standard's defaults.
+const STORAGE_BUFFERS: usize = 8;
+const WORKGROUP_BYTES: u32 = 16 << 10;
+const INVOCATIONS: u32 = 256;
+
+/// What a kernel asks for too much of.
+fn excess(kernel: &Kernel) -> Vec<String> {
+    let bytes = kernel.workgroup_bytes();
+    let mut all = vec![];
+    if kernel.bindings.len() > STORAGE_BUFFERS {
+        all.push(format!("{}: {} buffers", kernel.name, kernel.bindings.len()));
+    }
+    if bytes > WORKGROUP_BYTES {
+        all.push(format!("{}: {bytes} bytes of workgroup memory", kernel.name));
+    }
+    if kernel.workgroup_size > INVOCATIONS {
+        all.push(format!("{}: {} invocations", kernel.name, kernel.workgroup_size));
+    }
+    if kernel.workgroups.iter().any(|n| *n > Limits::default().max_workgroups) {
+        all.push(format!("{}: {:?} workgroups", kernel.name, kernel.workgroups));
+    }
+    all
+}
+
+fn check(name: &str, step: &Step) {
+    let program = compile(step, &Target::gpu()).unwrap_or_else(|e| panic!("{name}: {e}"));
+    let lowered = lower(&program, &mut Inputs::default(), &Limits::default());
+    let lowered = lowered.unwrap_or_else(|e| panic!("{name}: {e}"));
+    let kernels: Vec<&Kernel> = lowered.launches.iter().flat_map(|l| &l.kernels).collect();
+    assert!(!kernels.is_empty());
+    let found: Vec<String> = kernels.into_iter().flat_map(excess).collect();
+    assert!(found.is_empty(), "{name}\n{}", found.join("\n"));
+}
+
+#[test]
+fn every_form() {
+    for (name, step) in forms() {
+        check(name, &step);
+    }
+}
+
+#[test]
+fn planar_steps() {
+    for preset in ["planar-l2g", "planar-barf", "planar-inn", "planar-multi-inn"] {
+        check(preset, &Planar::new(preset, &["data.points_per_patch=4096"]).model.train_step());
+    }
+}
+
+#[test]
+fn steps_in_space() {
+    for preset in ["l2g-blender", "barf-llff", "inn-llff", "garf-llff", "nerf-blender-repr"] {
+        let mut layered = Layered::load(preset).unwrap_or_else(|e| panic!("{e}"));
+        layered.set("train.rays=120").unwrap_or_else(|e| panic!("{e}"));
+        let warp = warps::of_settings(&layered.settings, 20);
+        let size = ImageSize { height: 20, width: 20 };
+        let model = RadianceModel::new(&layered.settings, size, 20, warp).unwrap_or_else(|e| panic!("{preset}: {e}"));
+        for step in [model.train_step(), model.view(64), model.refinement()] {
+            check(preset, &step);
+        }
+    }
+}
