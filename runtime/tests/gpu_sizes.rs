@@ -249,6 +249,52 @@ fn two_programs_share_their_inputs(device: &Device) {
     assert_eq!(session.get("x").unwrap(), [4.0; 20]);
 }
 
+/// The same adapter as if it could bind 48 KiB at once.
+fn narrow(device: &Device) -> Device {
+    let limit = 48 << 10;
+    match device {
+        Device::Cpu { .. } => device.clone(),
+        #[cfg(feature = "wgpu")]
+        Device::Wgpu { .. } => {
+            let gpu = raygrad_runtime::wgpu::Gpu::open(None).unwrap().with_max_binding(limit);
+            Device::Wgpu { gpu: gpu.into() }
+        }
+        #[cfg(feature = "vulkan")]
+        Device::Vulkan { .. } => {
+            let gpu = raygrad_runtime::vulkan::Gpu::open(None).unwrap().with_max_binding(limit);
+            Device::Vulkan { gpu: gpu.into() }
+        }
+    }
+}
+
+/// Inputs, temporaries, scratch memory and outputs of several parts, in every kind of kernel.
+fn buffers_beyond_the_binding_limit(device: &Device) {
+    let device = &narrow(device);
+    layer(device, 2, 320, 24, 40, false);
+    let (frame, row, slot) = (Axis::new("frame", 3), Axis::new("row", 3000), Axis::new("slot", 32));
+    let x = Tensor::parameter("x", Shape::new(&[&frame, &row], 4));
+    let at = Tensor::data("at", Shape::new(&[&frame, &row], 1).with_dtype(DType::U32));
+    let from = Tensor::data("from", Shape::new(&[&frame, &Axis::new("place", 3500)], 1).with_dtype(DType::U32));
+    let summed = (x.sin() * &x).cumsum(&row);
+    let outputs = vec![
+        ("taken", x.take(&from, &row)),
+        ("scattered", x.scatter(&at, &slot, &Axes::new([frame.clone()]))),
+        ("summed", summed.clone()),
+        ("sum", summed.mean(&[&row])),
+        ("gradient", grad(&total(&(&summed * &summed * 1e-6)), &[&x]).remove(0)),
+    ];
+    check(device, outputs, 3e-5, "parts");
+    // An update in place, twice, set and read back through the session.
+    let double = Step { outputs: vec![], updates: vec![(x.clone(), &x * 2.0)] };
+    let mut session = Session::new(device.clone()).unwrap();
+    let id = session.add(compile(&double, &device.target()).unwrap()).unwrap();
+    let values: Vec<f32> = (0..4 * 9000).map(|i| i as f32).collect();
+    session.set("x", &values).unwrap();
+    session.run(id).unwrap();
+    session.run(id).unwrap();
+    assert!(session.get("x").unwrap() == values.iter().map(|v| 4.0 * v).collect::<Vec<_>>());
+}
+
 /// Every test on the best adapter of every backend.
 macro_rules! on_every_backend {
     ($($name:ident),* $(,)?) => {
@@ -273,4 +319,5 @@ on_every_backend!(
     compositing,
     training_follows_the_reference_and_repeats_bit_by_bit,
     two_programs_share_their_inputs,
+    buffers_beyond_the_binding_limit,
 );

@@ -1,7 +1,8 @@
 //! Where buffers lie: a few arenas hold everything, so that a kernel binds two or three buffers, not dozens.
 //!
 //! Inputs lie in arenas shared by all programs of a session; temporaries, outputs and scratch memory in arenas of the
-//! program. An arena holds lanes of one type and is at most as large as the device can bind.
+//! program. An arena holds lanes of one type and is at most as large as the device can bind; a buffer that is larger lies in
+//! parts, each in an arena.
 
 use super::LowerError;
 use raygrad_compiler::graph::Shape;
@@ -10,6 +11,7 @@ use raygrad_compiler::plan::region::BufferId;
 use raygrad_compiler::plan::{BufferKind, Program};
 use raygrad_compiler::scalar::DType;
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 /// Buffers start at multiples of this many lanes: 256 bytes, which suits every device's copies and cache lines.
 const ALIGN: u64 = 64;
@@ -19,6 +21,8 @@ const ALIGN: u64 = 64;
 pub struct Limits {
     /// Largest binding, in bytes.
     pub max_binding: u64,
+    /// Most buffers that a kernel binds.
+    pub max_buffers: u32,
     /// Most workgroups along one dimension of a dispatch.
     pub max_workgroups: u32,
 }
@@ -26,7 +30,7 @@ pub struct Limits {
 impl Default for Limits {
     /// What WebGPU guarantees.
     fn default() -> Limits {
-        Limits { max_binding: 128 << 20, max_workgroups: 65535 }
+        Limits { max_binding: 128 << 20, max_buffers: 8, max_workgroups: 65535 }
     }
 }
 
@@ -47,12 +51,38 @@ pub enum ArenaId {
     Own(usize),
 }
 
-/// Where a buffer lies in its arena, in lanes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// Where a buffer lies: its lanes in order, `stretch` of them in every part but the last.
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Place {
-    pub arena: ArenaId,
-    pub offset: u32,
+    pub parts: Vec<Part>,
+    pub stretch: u32,
     pub dtype: DType,
+}
+
+/// Where a part of a buffer begins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Part {
+    pub arena: ArenaId,
+    /// In lanes.
+    pub offset: u32,
+}
+
+impl Place {
+    /// The parts that hold the lanes of a range: from where on in each part, and which of the range.
+    pub fn pieces(&self, lanes: Range<usize>) -> Vec<(Part, Range<usize>)> {
+        let stretch = self.stretch as usize;
+        let mut all = vec![];
+        let mut at = lanes.start;
+        while at < lanes.end {
+            let number = at / stretch;
+            let end = lanes.end.min((number + 1) * stretch);
+            let part = self.parts[number];
+            let offset = part.offset + (at - number * stretch) as u32;
+            all.push((Part { offset, ..part }, at - lanes.start..end - lanes.start));
+            at = end;
+        }
+        all
+    }
 }
 
 /// Places of the inputs of all programs of a session, by name.
@@ -76,27 +106,23 @@ pub struct Layout<'a> {
 
 impl<'a> Layout<'a> {
     pub fn new(program: &Program, inputs: &'a mut Inputs, limits: &Limits) -> Result<Layout<'a>, LowerError> {
-        let max_lanes = (limits.max_binding / 4).min(u32::MAX as u64);
+        // Whole stretches of aligned lanes, at least one.
+        let max_lanes = ((limits.max_binding / 4).min(u32::MAX as u64) / ALIGN * ALIGN).max(ALIGN);
         let mut layout = Layout { inputs, own: vec![], buffers: vec![], max_lanes, scratch: vec![] };
         layout.inputs.sealed = layout.inputs.arenas.len();
         let mut slots: Vec<Option<Place>> = vec![None; program.slots.len()];
         for buffer in &program.buffers {
             let lanes = buffer.shape.lanes() as u64;
             let dtype = buffer.shape.dtype;
-            layout.fits(&buffer.label, lanes)?;
+            fits(&buffer.label, lanes)?;
             let place = match &buffer.kind {
                 BufferKind::Input { name, role } => layout.input(name, *role, &buffer.shape)?,
                 BufferKind::Output => layout.allocate("work", dtype, lanes),
                 // Integers lie among integers and share no slot: their bits must not pass through float registers.
                 BufferKind::Temporary { .. } if dtype == DType::U32 => layout.allocate("work", dtype, lanes),
-                BufferKind::Temporary { slot } => match slots[*slot] {
-                    Some(place) => place,
-                    None => {
-                        let place = layout.allocate("work", dtype, program.slots[*slot] as u64);
-                        slots[*slot] = Some(place);
-                        place
-                    }
-                },
+                BufferKind::Temporary { slot } => slots[*slot]
+                    .get_or_insert_with(|| layout.allocate("work", dtype, program.slots[*slot] as u64))
+                    .clone(),
             };
             // `relu network.rs:12` is called `relu` in kernels.
             let name = buffer.label.split(' ').next().unwrap_or_default();
@@ -105,17 +131,10 @@ impl<'a> Layout<'a> {
         Ok(layout)
     }
 
-    fn fits(&self, name: &str, lanes: u64) -> Result<(), LowerError> {
-        if lanes <= self.max_lanes {
-            return Ok(());
-        }
-        Err(LowerError::TooLarge { buffer: name.into(), bytes: 4 * lanes, limit: 4 * self.max_lanes })
-    }
-
     fn input(&mut self, name: &str, role: Role, shape: &Shape) -> Result<Place, LowerError> {
         if let Some((place, known)) = self.inputs.places.get(name) {
             return if same_layout(known, shape) {
-                Ok(*place)
+                Ok(place.clone())
             } else {
                 let (first, second) = (Box::new(known.clone()), Box::new(shape.clone()));
                 Err(LowerError::Conflict { name: name.into(), first, second })
@@ -124,16 +143,21 @@ impl<'a> Layout<'a> {
         let sealed = self.inputs.sealed;
         // Per-step values lie together: the host writes them in one go.
         let class = if role == Role::PerStep { "per_step" } else { "inputs" };
-        let (at, offset) = grow(&mut self.inputs.arenas, sealed, class, shape, self.max_lanes);
-        let place = Place { arena: ArenaId::Input(at), offset, dtype: shape.dtype };
-        self.inputs.places.insert(name.into(), (place, shape.clone()));
+        let (arenas, most) = (&mut self.inputs.arenas, self.max_lanes);
+        let place = in_parts(shape.dtype, shape.lanes() as u64, most, |lanes| {
+            let (at, offset) = grow(arenas, sealed, class, shape.dtype, lanes, most);
+            Part { arena: ArenaId::Input(at), offset }
+        });
+        self.inputs.places.insert(name.into(), (place.clone(), shape.clone()));
         Ok(place)
     }
 
     fn allocate(&mut self, class: &str, dtype: DType, lanes: u64) -> Place {
-        let flat = Shape::of(Default::default(), lanes as usize, dtype);
-        let (at, offset) = grow(&mut self.own, 0, class, &flat, self.max_lanes);
-        Place { arena: ArenaId::Own(at), offset, dtype }
+        let (arenas, most) = (&mut self.own, self.max_lanes);
+        in_parts(dtype, lanes, most, |lanes| {
+            let (at, offset) = grow(arenas, 0, class, dtype, lanes, most);
+            Part { arena: ArenaId::Own(at), offset }
+        })
     }
 
     /// Starts a launch: scratch memory of the ones before it is free again.
@@ -143,15 +167,21 @@ impl<'a> Layout<'a> {
 
     /// A buffer that lives during this launch.
     pub fn scratch(&mut self, name: &str, shape: Shape) -> Result<BufferId, LowerError> {
-        let lanes = (shape.lanes() as u64).next_multiple_of(ALIGN);
-        self.fits("scratch memory", lanes)?;
-        let room =
-            |layout: &Layout, s: &(usize, u64)| layout.own[s.0].dtype == shape.dtype && s.1 + lanes <= layout.max_lanes;
-        let at = match self.scratch.iter().position(|s| room(self, s)) {
+        let lanes = shape.lanes() as u64;
+        fits("scratch memory", lanes)?;
+        let (dtype, most) = (shape.dtype, self.max_lanes);
+        let place = in_parts(dtype, lanes, most, |lanes| self.scratch_part(dtype, lanes));
+        self.buffers.push((place, shape, name.into()));
+        Ok(BufferId(self.buffers.len() as u32 - 1))
+    }
+
+    fn scratch_part(&mut self, dtype: DType, lanes: u64) -> Part {
+        let room = |s: &(usize, u64)| self.own[s.0].dtype == dtype && s.1 + lanes <= self.max_lanes;
+        let at = match self.scratch.iter().position(room) {
             Some(at) => at,
             None => {
-                let name = arena_name(&self.own, "scratch", shape.dtype);
-                self.own.push(Arena { name, dtype: shape.dtype, lanes: 0 });
+                let name = arena_name(&self.own, "scratch", dtype);
+                self.own.push(Arena { name, dtype, lanes: 0 });
                 self.scratch.push((self.own.len() - 1, 0));
                 self.scratch.len() - 1
             }
@@ -159,13 +189,11 @@ impl<'a> Layout<'a> {
         let (arena, offset) = self.scratch[at];
         self.scratch[at].1 += lanes;
         self.own[arena].lanes = self.own[arena].lanes.max(offset + lanes);
-        let place = Place { arena: ArenaId::Own(arena), offset: offset as u32, dtype: shape.dtype };
-        self.buffers.push((place, shape, name.into()));
-        Ok(BufferId(self.buffers.len() as u32 - 1))
+        Part { arena: ArenaId::Own(arena), offset: offset as u32 }
     }
 
-    pub fn place(&self, buffer: BufferId) -> Place {
-        self.buffers[buffer.0 as usize].0
+    pub fn place(&self, buffer: BufferId) -> &Place {
+        &self.buffers[buffer.0 as usize].0
     }
 
     pub fn shape(&self, buffer: BufferId) -> &Shape {
@@ -186,7 +214,7 @@ impl<'a> Layout<'a> {
 
     /// Places and lanes of the program's `count` buffers.
     pub fn places(&self, count: usize) -> Vec<(Place, usize)> {
-        self.buffers[..count].iter().map(|b| (b.0, b.1.lanes())).collect()
+        self.buffers[..count].iter().map(|b| (b.0.clone(), b.1.lanes())).collect()
     }
 }
 
@@ -196,13 +224,32 @@ fn same_layout(a: &Shape, b: &Shape) -> bool {
     sizes(a) == sizes(b) && a.channels.count() == b.channels.count() && a.dtype == b.dtype
 }
 
-/// Puts `shape` into the first arena of its class and type, from `first` on, that has room, or a new one.
-fn grow(arenas: &mut Vec<Arena>, first: usize, class: &str, shape: &Shape, max_lanes: u64) -> (usize, u32) {
-    let lanes = (shape.lanes() as u64).next_multiple_of(ALIGN);
-    let fits = |a: &Arena| a.dtype == shape.dtype && a.name.starts_with(class) && a.lanes + lanes <= max_lanes;
+/// Lanes are counted in 32 bits.
+fn fits(name: &str, lanes: u64) -> Result<(), LowerError> {
+    match u32::try_from(lanes) {
+        Ok(_) => Ok(()),
+        Err(_) => Err(LowerError::TooLarge { buffer: name.into(), bytes: 4 * lanes, limit: 4 * u64::from(u32::MAX) }),
+    }
+}
+
+/// A place for so many lanes: `put` is given the lanes of one part after the other, multiples of [`ALIGN`] up to `most`.
+fn in_parts(dtype: DType, lanes: u64, most: u64, mut put: impl FnMut(u64) -> Part) -> Place {
+    let mut parts = vec![];
+    let mut left = lanes.next_multiple_of(ALIGN).max(ALIGN);
+    while left > 0 {
+        let part = left.min(most);
+        parts.push(put(part));
+        left -= part;
+    }
+    Place { parts, stretch: most as u32, dtype }
+}
+
+/// Puts lanes into the first arena of a class and type, from `first` on, that has room, or a new one.
+fn grow(arenas: &mut Vec<Arena>, first: usize, class: &str, dtype: DType, lanes: u64, most: u64) -> (usize, u32) {
+    let fits = |a: &Arena| a.dtype == dtype && a.name.starts_with(class) && a.lanes + lanes <= most;
     let at = (first..arenas.len()).find(|i| fits(&arenas[*i])).unwrap_or_else(|| {
-        let name = arena_name(arenas, class, shape.dtype);
-        arenas.push(Arena { name, dtype: shape.dtype, lanes: 0 });
+        let name = arena_name(arenas, class, dtype);
+        arenas.push(Arena { name, dtype, lanes: 0 });
         arenas.len() - 1
     });
     let offset = arenas[at].lanes;
@@ -210,9 +257,14 @@ fn grow(arenas: &mut Vec<Arena>, first: usize, class: &str, shape: &Shape, max_l
     (at, offset as u32)
 }
 
-/// `work`, `work_u32`, and with a letter from the second of a kind on.
+/// `work`, `work_u32`, and with a letter or two from the second of a kind on.
 fn arena_name(arenas: &[Arena], class: &str, dtype: DType) -> String {
     let stem = if dtype == DType::U32 { format!("{class}_u32") } else { class.to_string() };
     let same = arenas.iter().filter(|a| a.dtype == dtype && a.name.starts_with(class)).count();
-    if same == 0 { stem } else { format!("{stem}_{}", (b'a' + (same % 26) as u8) as char) }
+    let letter = |n: usize| (b'a' + (n % 26) as u8) as char;
+    match same {
+        0 => stem,
+        1..26 => format!("{stem}_{}", letter(same)),
+        _ => format!("{stem}_{}{}", letter(same / 26 - 1), letter(same)),
+    }
 }

@@ -1,7 +1,7 @@
 //! A kernel being built: naga statements, the arenas it binds, and positions in the domain.
 
 use super::builder::{Builder, Kind, Memory, Value};
-use super::layout::{ArenaId, Layout, Limits, Place};
+use super::layout::{Arena, ArenaId, Layout, Limits, Part, Place};
 use super::{Binding, Kernel, LowerError};
 use naga::BuiltIn;
 use raygrad_compiler::graph::{Axes, Axis};
@@ -20,6 +20,7 @@ pub(super) struct Emit<'l, 'a> {
     /// Number of the invocation in its workgroup.
     pub invocation: Value,
     groups: [u32; 3],
+    limits: Limits,
 }
 
 impl<'l, 'a> Emit<'l, 'a> {
@@ -41,7 +42,7 @@ impl<'l, 'a> Emit<'l, 'a> {
             workgroup = b.add(before, workgroup);
         }
         let groups = [columns as u32, rows.max(1) as u32, 1];
-        Ok(Emit { b, layout, bound: vec![], workgroup, invocation, groups })
+        Ok(Emit { b, layout, bound: vec![], workgroup, invocation, groups, limits })
     }
 
     /// Starts a kernel of `count` invocations; leaves the spare ones of the last workgroup. Returns its number, too.
@@ -66,38 +67,72 @@ impl<'l, 'a> Emit<'l, 'a> {
         self.b.close_if();
     }
 
-    fn memory(&mut self, place: Place, write: bool) -> Memory {
-        if let Some(known) = self.bound.iter_mut().find(|b| b.0 == place.arena) {
+    fn memory(&mut self, arena: ArenaId, write: bool) -> Memory {
+        if let Some(known) = self.bound.iter_mut().find(|b| b.0 == arena) {
             if write && !known.2 {
                 known.2 = true;
                 self.b.make_writable(known.1);
             }
             return known.1;
         }
-        let arena = self.layout.arena(place.arena);
-        let memory = self.b.storage(&arena.name, arena.dtype.into());
+        let Arena { name, dtype, .. } = self.layout.arena(arena);
+        let memory = self.b.storage(name, (*dtype).into());
         if write {
             self.b.make_writable(memory);
         }
-        self.bound.push((place.arena, memory, write));
+        self.bound.push((arena, memory, write));
         memory
     }
 
     /// Lane `index` of a buffer.
     pub fn load(&mut self, buffer: BufferId, index: Value) -> Value {
         let place = self.layout.place(buffer);
-        let memory = self.memory(place, false);
-        let offset = self.b.u(place.offset);
-        let at = self.b.add(index, offset);
-        self.b.load(memory, at)
+        if let [part] = place.parts[..] {
+            return self.load_part(part, index);
+        }
+        let nothing = self.b.literal(place.dtype.into(), 0);
+        let found = self.b.var("found", nothing);
+        self.in_part(place, index, &mut |e, part, index| {
+            let value = e.load_part(part, index);
+            e.b.set(found, value);
+        });
+        self.b.get(found)
     }
 
     pub fn store(&mut self, buffer: BufferId, index: Value, value: Value) {
         let place = self.layout.place(buffer);
-        let memory = self.memory(place, true);
-        let offset = self.b.u(place.offset);
+        self.in_part(place, index, &mut |e, part, index| {
+            let memory = e.memory(part.arena, true);
+            let offset = e.b.u(part.offset);
+            let at = e.b.add(index, offset);
+            e.b.store(memory, at, value);
+        });
+    }
+
+    fn load_part(&mut self, part: Part, index: Value) -> Value {
+        let memory = self.memory(part.arena, false);
+        let offset = self.b.u(part.offset);
         let at = self.b.add(index, offset);
-        self.b.store(memory, at, value);
+        self.b.load(memory, at)
+    }
+
+    /// Does something in the part that holds lane `index`, with the number that the lane has there.
+    fn in_part(&mut self, place: &Place, index: Value, access: &mut dyn FnMut(&mut Self, Part, Value)) {
+        let last = place.parts.len() - 1;
+        for (i, part) in place.parts.iter().enumerate() {
+            if i < last {
+                let end = self.b.u((i as u32 + 1) * place.stretch);
+                let here = self.b.less(index, end);
+                self.b.open_if(here);
+            }
+            let first = self.b.u(i as u32 * place.stretch);
+            let own = self.b.sub(index, first);
+            access(self, *part, own);
+            if i < last {
+                self.b.open_else();
+            }
+        }
+        (0..last).for_each(|_| self.b.close_if());
     }
 
     /// Lane index of a channel of an element.
@@ -111,6 +146,10 @@ impl<'l, 'a> Emit<'l, 'a> {
     /// Validates the kernel.
     pub fn finish(self, name: impl Into<String>) -> Result<Kernel, LowerError> {
         let name = name.into();
+        let Limits { max_buffers: limit, max_binding: bytes, .. } = self.limits;
+        if self.bound.len() > limit as usize {
+            return Err(LowerError::TooManyBuffers { kernel: name, buffers: self.bound.len(), limit, bytes });
+        }
         let workgroup_size = self.b.workgroup_size;
         let module = self.b.finish();
         let mut validator =

@@ -27,7 +27,7 @@ mod scatter;
 mod stages;
 mod tile;
 
-pub use layout::{Arena, ArenaId, Inputs, Limits, Place};
+pub use layout::{Arena, ArenaId, Inputs, Limits, Part, Place};
 
 use layout::Layout;
 use raygrad_compiler::graph::Shape;
@@ -72,12 +72,14 @@ pub struct GpuProgram {
 
 #[derive(Debug, thiserror::Error)]
 pub enum LowerError {
-    #[error("`{buffer}` has {bytes} bytes, but the device binds at most {limit} at once")]
+    #[error("`{buffer}` has {bytes} bytes, but a kernel counts up to {limit}")]
     TooLarge { buffer: String, bytes: u64, limit: u64 },
     #[error("input `{name}` is {first} in one program and {second} in another; one name is one buffer")]
     Conflict { name: String, first: Box<Shape>, second: Box<Shape> },
     #[error("a launch needs {workgroups} workgroups, more than the device can start at once")]
     TooManyWorkgroups { workgroups: u64 },
+    #[error("kernel `{kernel}` binds {buffers} buffers, the device {limit} (and {bytes} bytes of one at most)")]
+    TooManyBuffers { kernel: String, buffers: usize, limit: u32, bytes: u64 },
     #[error("kernel `{kernel}` is not valid: {message}")]
     Invalid { kernel: String, message: String },
     #[error("kernel `{kernel}` cannot be written: {message}")]

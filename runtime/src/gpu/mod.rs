@@ -10,9 +10,10 @@ use raygrad_compiler::Program;
 use raygrad_compiler::fuse::TargetKind;
 use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::plan::region::BufferId;
-use raygrad_kernels::gpu::{Arena, ArenaId, GpuLaunch, Inputs, Limits, LowerError, Place, lower};
+use raygrad_kernels::gpu::{Arena, ArenaId, GpuLaunch, Inputs, Limits, LowerError, Part, Place, lower};
 use std::collections::BTreeMap;
 use std::fmt;
+use std::ops::Range;
 use std::sync::Arc;
 
 /// Steps that may be queued before the host waits for the oldest.
@@ -144,12 +145,9 @@ impl<A: Api> GpuExecutor<A> {
     }
 
     /// Where an input lies, with its length in lanes.
-    fn input(&self, name: &str) -> Result<(usize, Place, usize), RunError> {
-        let (place, shape) = self.inputs.places.get(name).ok_or_else(|| RunError::UnknownInput(name.into()))?;
-        match place.arena {
-            ArenaId::Input(arena) => Ok((arena, *place, shape.lanes())),
-            ArenaId::Own(_) => Err(RunError::UnknownInput(name.into())),
-        }
+    fn input(&self, name: &str) -> Result<(&Place, usize), RunError> {
+        let found = self.inputs.places.get(name).ok_or_else(|| RunError::UnknownInput(name.into()))?;
+        Ok((&found.0, found.1.lanes()))
     }
 
     /// Writes what the host changed of the per-step inputs.
@@ -174,9 +172,11 @@ impl<A: Api> Executor for GpuExecutor<A> {
         }
         for (name, role, _) in program.inputs() {
             if role == Role::PerStep {
-                let (arena, _, _) = self.input(name)?;
-                let lanes = self.inputs.arenas[arena].lanes as usize;
-                self.mirrors.entry(arena).or_insert_with(|| Mirror { lanes: vec![0; lanes], changed: false });
+                let place = self.input(name)?.0.clone();
+                for arena in place.parts.iter().filter_map(of_inputs) {
+                    let lanes = self.inputs.arenas[arena].lanes as usize;
+                    self.mirrors.entry(arena).or_insert_with(|| Mirror { lanes: vec![0; lanes], changed: false });
+                }
             }
         }
         let arenas = lowered.arenas.iter().map(|a| self.api.buffer(a)).collect::<Result<Vec<_>, _>>()?;
@@ -186,22 +186,26 @@ impl<A: Api> Executor for GpuExecutor<A> {
     }
 
     fn set(&mut self, input: &str, first: usize, lanes: &[u32]) -> Result<(), RunError> {
-        let (arena, place, _) = self.input(input)?;
-        let first = place.offset as usize + first;
-        match self.mirrors.get_mut(&arena) {
-            Some(mirror) => {
-                mirror.lanes[first..first + lanes.len()].copy_from_slice(lanes);
-                mirror.changed = true;
-                Ok(())
+        let pieces = self.input(input)?.0.pieces(first..first + lanes.len());
+        for (part, range) in pieces {
+            let Some(arena) = of_inputs(&part) else { continue };
+            let (at, lanes) = (part.offset as usize, &lanes[range]);
+            match self.mirrors.get_mut(&arena) {
+                Some(mirror) => {
+                    mirror.lanes[at..at + lanes.len()].copy_from_slice(lanes);
+                    mirror.changed = true;
+                }
+                None => self.api.write(&self.arenas[arena], at, lanes)?,
             }
-            None => self.api.write(&self.arenas[arena], first, lanes),
         }
+        Ok(())
     }
 
     fn get(&mut self, input: &str) -> Result<Vec<u32>, RunError> {
         self.flush()?;
-        let (arena, place, lanes) = self.input(input)?;
-        self.api.read(&self.arenas[arena], place.offset as usize, lanes)
+        let (place, lanes) = self.input(input)?;
+        let pieces = place.pieces(0..lanes);
+        read(&mut self.api, &pieces, &self.arenas, &[])
     }
 
     fn run(&mut self, program: usize) -> Result<(), RunError> {
@@ -217,10 +221,33 @@ impl<A: Api> Executor for GpuExecutor<A> {
     fn output(&mut self, program: usize, buffer: BufferId) -> Result<Vec<u32>, RunError> {
         self.flush()?;
         let program = &self.programs[program];
-        let (place, lanes) = program.places[buffer.0 as usize];
-        let from = bound(place.arena, &self.arenas, &program.arenas);
-        self.api.read(from, place.offset as usize, lanes)
+        let (place, lanes) = &program.places[buffer.0 as usize];
+        read(&mut self.api, &place.pieces(0..*lanes), &self.arenas, &program.arenas)
     }
+}
+
+/// The arena of a part, if inputs lie there.
+fn of_inputs(part: &Part) -> Option<usize> {
+    match part.arena {
+        ArenaId::Input(arena) => Some(arena),
+        ArenaId::Own(_) => None,
+    }
+}
+
+/// The lanes of pieces of a buffer.
+fn read<A: Api>(
+    api: &mut A,
+    pieces: &[(Part, Range<usize>)],
+    inputs: &[A::Buffer],
+    own: &[A::Buffer],
+) -> Result<Vec<u32>, RunError> {
+    let mut lanes = vec![];
+    for (part, range) in pieces {
+        let found = api.read(bound(part.arena, inputs, own), part.offset as usize, range.len())?;
+        // Mostly there is one piece, which is not copied again.
+        if lanes.is_empty() { lanes = found } else { lanes.extend(found) }
+    }
+    Ok(lanes)
 }
 
 /// The buffer of an arena.

@@ -90,6 +90,7 @@ impl Gpu {
             let properties = properties.properties;
             let limits = Limits {
                 max_binding: most.max_memory_allocation_size.min(properties.limits.max_storage_buffer_range as u64),
+                max_buffers: properties.limits.max_per_stage_descriptor_storage_buffers,
                 max_workgroups: properties.limits.max_compute_work_group_count[0],
             };
             let clock = (bits > 0).then(|| Clock {
@@ -128,6 +129,13 @@ impl Gpu {
                 instance,
             })
         }
+    }
+
+    /// The same device as if a kernel could bind no more than so many bytes of a buffer at once: larger buffers then lie in
+    /// parts.
+    pub fn with_max_binding(mut self, bytes: u64) -> Gpu {
+        self.limits.max_binding = self.limits.max_binding.min(bytes);
+        self
     }
 
     pub fn adapter(&self) -> &Adapter {

@@ -70,6 +70,7 @@ impl Gpu {
         });
         let limits = Limits {
             max_binding: limits.max_storage_buffer_binding_size.min(limits.max_buffer_size),
+            max_buffers: limits.max_storage_buffers_per_shader_stage,
             max_workgroups: limits.max_compute_workgroups_per_dimension,
         };
         let key = api::util::pipeline_cache_key(&adapter.get_info());
@@ -84,6 +85,13 @@ impl Gpu {
             (file, unsafe { device.create_pipeline_cache(&description) })
         });
         Ok(Gpu { device, queue, adapter: info, limits, cache, failed })
+    }
+
+    /// The same device as if a kernel could bind no more than so many bytes of a buffer at once: larger buffers then lie in
+    /// parts.
+    pub fn with_max_binding(mut self, bytes: u64) -> Gpu {
+        self.limits.max_binding = self.limits.max_binding.min(bytes);
+        self
     }
 
     pub fn adapter(&self) -> &Adapter {
