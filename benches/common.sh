@@ -1,7 +1,7 @@
 # Sourced by the scripts beside it: builds the measurements and sets $raygrad to the command they measure.
 # RAYGRAD_QUICK=1 does a minimum of work in the dev profile: it proves that the scripts run and measures nothing.
 set -euo pipefail
-root=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
+root=$(cd -P "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 profile=release
 [ -z "${RAYGRAD_QUICK:-}" ] || profile=debug
 built=${CARGO_TARGET_DIR:-$root/target}/$profile

@@ -124,8 +124,8 @@ fn main() -> anyhow::Result<()> {
         device = own.values().flatten().last().map(|b| b.device.clone()).context("no device was asked for")?;
         report(&mut text, work, &own, &others)?;
     }
-    let name: String = device.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '-' }).collect();
-    let file = args.out.join(format!("{}.md", name.trim_matches('-')));
+    let words: Vec<&str> = device.split(|c: char| !c.is_ascii_alphanumeric()).filter(|w| !w.is_empty()).collect();
+    let file = args.out.join(format!("{}.md", words.join("-")));
     let head =
         format!("# {device}\n\n`benches/gpu.sh --rounds {} --scale {}`, f32, medians.\n", args.rounds, args.scale);
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
@@ -151,7 +151,7 @@ impl Args {
         command.args(["bench", work.preset, "--json", "--launches", "--device", device]);
         command.args(["--set", &format!("{}={rows}", work.setting)]);
         if quick() {
-            command.args(["--steps", "1", "--set", "field.layers=[16,16]", "--set", "field.skip=[]"]);
+            command.args(["--steps", "1", "--set", "field.layers=[16,16]"]);
             command.args(["--set", "warp.layers=[16,16]", "--set", "warp.skip=[]"]);
             if work.preset == "l2g-blender" {
                 command.args(["--set", "scene.image_size=[16,16]", "--set", "scene.train_views=4"]);

@@ -17,10 +17,6 @@ pub struct Ceilings {
 
 /// Lanes of the buffer that passes through: 64 MiB, more than caches hold.
 const LANES: usize = 16 << 20;
-/// Elements, channels and length of the chains of multiply-adds.
-const ELEMENTS: usize = 1 << 20;
-const CHAINS: usize = 8;
-const LENGTH: usize = 128;
 const ROUNDS: usize = 5;
 
 impl Device {
@@ -31,7 +27,10 @@ impl Device {
         let gflops = match self {
             Device::Cpu { pool } => peak_gflops(pool.current_num_threads(), 150.0),
             #[cfg(feature = "gpu")]
-            _ => 2e-9 * (ELEMENTS * CHAINS * LENGTH) as f64 / self.fastest(&multiply_adds())?,
+            _ => {
+                let (step, operations) = multiply_adds();
+                operations / self.fastest(&step)? * 1e-9
+            }
         };
         Ok(Ceilings { gflops, gbytes })
     }
@@ -69,9 +68,12 @@ fn copy() -> Step {
     Step { outputs: vec![("done".into(), done)], updates: vec![(x.clone(), &x * 0.5 + 1.0)] }
 }
 
-/// Independent chains of multiply-adds whose factors nobody knows when compiling.
+/// Independent chains of multiply-adds whose factors nobody knows when compiling, and their operations.
 #[cfg(feature = "gpu")]
-fn multiply_adds() -> Step {
+fn multiply_adds() -> (Step, f64) {
+    const ELEMENTS: usize = 1 << 20;
+    const CHAINS: usize = 8;
+    const LENGTH: usize = 128;
     let element = Axis::new("element", ELEMENTS);
     let factor = |name: &str| Tensor::input(name, Role::State, Shape::new(&[], CHAINS));
     let (a, b) = (factor("a"), factor("b"));
@@ -79,5 +81,6 @@ fn multiply_adds() -> Step {
     for _ in 0..LENGTH {
         x = &x * &a + &b;
     }
-    Step { outputs: vec![("done".into(), x.sum_channels().sum(&[&element]))], updates: vec![] }
+    let outputs = vec![("done".into(), x.sum_channels().sum(&[&element]))];
+    (Step { outputs, updates: vec![] }, 2.0 * (ELEMENTS * CHAINS * LENGTH) as f64)
 }

@@ -7,7 +7,7 @@
 use raygrad_compiler::plan::region::RegionOp;
 use raygrad_compiler::{Program, StepError, Target, compile};
 use raygrad_runtime::Device;
-use raygrad_tests::backend::{devices, devices_for_large_programs};
+use raygrad_tests::backend::{devices_for_large_programs, vulkan, wgpu};
 use raygrad_tests::check::{check, same_bits};
 use raygrad_tests::graphs::{Recipe, shrink};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -20,6 +20,9 @@ fn large() -> u64 {
 
 /// Graphs of a run that are small enough for a software GPU, which takes half a second each.
 const SMALL: u64 = 500;
+
+/// Those that also run through Vulkan: the kernels are the same as through wgpu.
+const THROUGH_VULKAN: u64 = 100;
 
 /// Every other seed of the graphs to check, so that halves run side by side.
 fn seeds(count: u64, half: u64) -> impl Iterator<Item = u64> {
@@ -104,10 +107,21 @@ fn second_half() {
 
 #[test]
 fn small_graphs_first_half() {
-    check_graphs(&devices(), Recipe::small, seeds(SMALL, 0));
+    check_graphs(&without_vulkan(), Recipe::small, seeds(SMALL, 0));
 }
 
 #[test]
 fn small_graphs_second_half() {
-    check_graphs(&devices(), Recipe::small, seeds(SMALL, 1));
+    check_graphs(&without_vulkan(), Recipe::small, seeds(SMALL, 1));
+}
+
+fn without_vulkan() -> Vec<Device> {
+    let cpu = Device::cpu(Some(2)).expect("starts threads");
+    std::iter::once(cpu).chain(wgpu()).collect()
+}
+
+#[test]
+fn small_graphs_through_vulkan() {
+    let devices: Vec<Device> = vulkan().into_iter().collect();
+    check_graphs(&devices, Recipe::small, seeds(THROUGH_VULKAN, 0).chain(seeds(THROUGH_VULKAN, 1)));
 }

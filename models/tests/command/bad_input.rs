@@ -99,6 +99,11 @@ fn invertible_warps_that_do_not_fit() {
 fn a_device_that_is_not_there() {
     let w = Workplace::new();
     mentions(&w.refuse(&["train", "tiny.toml", "--device", "wgpu:99", "--out", "run"]), &["error:"]);
+    mentions(&w.refuse(&["train", "tiny.toml", "--device", "vulkan:99", "--out", "run"]), &["error:"]);
+    mentions(
+        &w.refuse(&["train", "tiny.toml", "--device", "vulkan:x", "--out", "run"]),
+        &["`auto`, `cpu`, `wgpu`, `vulkan`, `wgpu:N` or `vulkan:N`, found `vulkan:x`"],
+    );
     assert!(w.left_behind().is_empty());
 }
 

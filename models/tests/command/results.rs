@@ -142,6 +142,18 @@ fn bench_prints_the_numbers_of_a_step() {
     let weights = (14 * 16 + 16 * 16 + 16 * 3) + (8 * 16 + 24 * 16 + 16 * 3);
     let expected = 6.0 * 3.0 * 40.0 * f64::from(weights) / 1e9;
     assert!((bench["gflop_per_step"].as_f64().unwrap() / expected - 1.0).abs() < 1e-9, "{text}");
+    assert!(bench.get("per_launch").is_none());
+    // Launch by launch, for scripts, for people and for Perfetto.
+    let text = w.succeed(&["bench", "tiny.toml", "--steps", "1", "--json", "--launches", "--trace", "trace.json"]);
+    let bench: Value = serde_json::from_str(&text).unwrap();
+    let launches = bench["per_launch"].as_array().unwrap();
+    assert_eq!(launches.len() as u64, bench["launches"].as_u64().unwrap());
+    assert!(launches.iter().any(|l| l["seconds"].as_f64().unwrap() > 0.0 && l["gflop"].as_f64().unwrap() > 0.0));
+    let events = w.json("trace.json")["traceEvents"].as_array().unwrap().clone();
+    let of_launches = events.iter().filter(|e| e["args"]["MFLOP"].is_number()).count();
+    assert!(of_launches > launches.len() && of_launches.is_multiple_of(launches.len()), "{events:?}");
+    let text = w.succeed(&["bench", "tiny.toml", "--steps", "1", "--launches"]);
+    assert!(launches.iter().all(|l| text.contains(l["name"].as_str().unwrap())) && text.contains("at best"), "{text}");
 }
 
 #[cfg(feature = "gpu")]
