@@ -100,8 +100,16 @@ impl Queue {
         }
         let Some(back) = &mut self.back else { return Ok(vec![]) };
         let region = vk::BufferCopy { src_offset: first, dst_offset: 0, size };
+        let (copies, host) = (vk::PipelineStageFlags::TRANSFER, vk::PipelineStageFlags::HOST);
+        let seen = [vk::MemoryBarrier::default()
+            .src_access_mask(vk::AccessFlags::TRANSFER_WRITE)
+            .dst_access_mask(vk::AccessFlags::HOST_READ)];
         // SAFETY: `commands` is being recorded, and both ranges lie inside their buffers.
-        unsafe { self.gpu.device.cmd_copy_buffer(commands, buffer.raw, back.raw, &[region]) };
+        unsafe {
+            self.gpu.device.cmd_copy_buffer(commands, buffer.raw, back.raw, &[region]);
+            // The end of a submission does not make what it wrote visible to the host.
+            self.gpu.device.cmd_pipeline_barrier(commands, copies, host, Default::default(), &seen, &[], &[]);
+        }
         let at = self.at;
         self.submit(None)?;
         self.wait(at)?;
@@ -189,12 +197,12 @@ impl Drop for Queue {
     }
 }
 
-/// Everything recorded or submitted before is done, and seen by everything after: kernels, copies, and the host.
+/// What kernels and copies did that were recorded or submitted before is done, and seen by those after.
 pub(super) fn barrier(gpu: &Gpu, commands: vk::CommandBuffer) {
     let shader = vk::AccessFlags::SHADER_READ | vk::AccessFlags::SHADER_WRITE;
     let copies = vk::AccessFlags::TRANSFER_READ | vk::AccessFlags::TRANSFER_WRITE;
-    let (before, after) = (shader | copies, shader | copies);
-    let memory = [vk::MemoryBarrier::default().src_access_mask(before).dst_access_mask(after)];
+    let all = shader | copies;
+    let memory = [vk::MemoryBarrier::default().src_access_mask(all).dst_access_mask(all)];
     let stages = vk::PipelineStageFlags::COMPUTE_SHADER | vk::PipelineStageFlags::TRANSFER;
     // SAFETY: `commands` is being recorded.
     unsafe { gpu.device.cmd_pipeline_barrier(commands, stages, stages, Default::default(), &memory, &[], &[]) };
