@@ -13,4 +13,4 @@ exec "$built/examples/seeds" --seeds 0..20 \
     --presets planar-barf-small,planar-l2g-small,planar-multi-inn-small,planar-inn-small "${picture[@]}" \
     --set noise.kind=barf --set noise.homography=0.1 --set noise.translation=0.2 \
     --set 'field.layers=[128,128,128,128]' --set 'warp.layers=[128,128,128,128,128,128]' \
-    --set 'warp.output_scale=[0.25,0.25]' --set optim.steps=1500 --set optim.warmup_pose=200 "$@"
+    --set 'warp.output_scale=[0.25,0.25]' --set optim.steps=2500 --set optim.warmup_pose=200 "$@"

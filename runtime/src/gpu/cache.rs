@@ -3,6 +3,7 @@
 //! One file an adapter and driver, `raygrad/<key>.bin` in the user's folder for caches: a hash of the driver's bytes, so
 //! that no driver gets a damaged file, then the bytes. A file that cannot be read or written is as good as none.
 
+use etcetera::{BaseStrategy, choose_base_strategy};
 use std::path::PathBuf;
 
 /// A larger cache is not kept, and starts anew.
@@ -18,7 +19,8 @@ pub(crate) struct CacheFile {
 impl CacheFile {
     /// The file, and what it holds: nothing where there is none, or a damaged one.
     pub fn open(key: &str) -> (CacheFile, Vec<u8>) {
-        let path = dirs::cache_dir().map(|d| d.join("raygrad").join(format!("{key}.bin")));
+        let folder = choose_base_strategy().ok().map(|s| s.cache_dir());
+        let path = folder.map(|f| f.join("raygrad").join(format!("{key}.bin")));
         CacheFile::at(path)
     }
 
