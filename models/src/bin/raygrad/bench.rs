@@ -1,6 +1,6 @@
 //! `raygrad bench`: how long a training step takes, launch by launch, against what the device could do at best.
 
-use crate::Choice;
+use crate::{Choice, print};
 use clap::Args;
 use raygrad::config::{ConfigError, Count};
 use raygrad::training::Training;
@@ -9,6 +9,7 @@ use raygrad_kernels::cpu::peak::peak_gflops;
 use raygrad_runtime::{Ceilings, Device};
 use serde::Serialize;
 use serde_json::json;
+use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
@@ -139,19 +140,21 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
         per_launch: if args.launches { launches(program, &profiled) } else { vec![] },
     };
     if args.json {
-        println!("{}", serde_json::to_string(&result)?);
+        print(&format!("{}\n", serde_json::to_string(&result)?))?;
         return Ok(ExitCode::SUCCESS);
     }
-    println!("{} on {}, {}", result.preset, result.device, trainer.work());
-    println!("step      {:.2} ms (median of {}), {} launches", 1e3 * seconds, result.steps, result.launches);
-    println!("rate      {:.1} GFLOP/s of {:.1} ({:.0} %)", result.gflops, peak, 100.0 * result.gflops / peak);
-    println!("memory    {:.0} MB at most", result.peak_rss_mb);
+    let mut text = String::new();
+    writeln!(text, "{} on {}, {}", result.preset, result.device, trainer.work())?;
+    writeln!(text, "step      {:.2} ms (median of {}), {} launches", 1e3 * seconds, result.steps, result.launches)?;
+    writeln!(text, "rate      {:.1} GFLOP/s of {:.1} ({:.0} %)", result.gflops, peak, 100.0 * result.gflops / peak)?;
+    writeln!(text, "memory    {:.0} MB at most", result.peak_rss_mb)?;
     if let Some(host) = result.host_seconds_per_step {
-        println!("host      {:.0} us a step, beside the device", 1e6 * host);
+        writeln!(text, "host      {:.0} us a step, beside the device", 1e6 * host)?;
     }
     if let (true, Some(ceilings)) = (args.launches, ceilings) {
-        print_launches(&result.per_launch, ceilings);
+        write_launches(&mut text, &result.per_launch, ceilings)?;
     }
+    print(&text)?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -201,13 +204,14 @@ fn launches(program: &Program, profiled: &[Vec<f64>]) -> Vec<Launch> {
 }
 
 /// A line a launch: its share of the step, and its rates, absolute and in per cent of the ceilings.
-fn print_launches(launches: &[Launch], ceilings: Ceilings) {
+fn write_launches(text: &mut String, launches: &[Launch], ceilings: Ceilings) -> std::fmt::Result {
     let total: f64 = launches.iter().map(|l| l.seconds).sum();
     let width = launches.iter().map(|l| l.name.len()).max().unwrap_or(0).max(6);
-    println!("\n{:width$}  {:>9}  {:>6}  {:>16}  {:>14}", "launch", "ms", "share", "GFLOP/s", "GB/s");
+    writeln!(text, "\n{:width$}  {:>9}  {:>6}  {:>16}  {:>14}", "launch", "ms", "share", "GFLOP/s", "GB/s")?;
     for l in launches {
         let (flops, bytes) = (l.gflop / l.seconds.max(1e-9), l.gbytes / l.seconds.max(1e-9));
-        println!(
+        writeln!(
+            text,
             "{:width$}  {:>9.3}  {:>4.0} %  {:>9.1} ({:>2.0} %)  {:>7.1} ({:>2.0} %)",
             l.name,
             1e3 * l.seconds,
@@ -216,15 +220,16 @@ fn print_launches(launches: &[Launch], ceilings: Ceilings) {
             100.0 * flops / ceilings.gflops,
             bytes,
             100.0 * bytes / ceilings.gbytes,
-        );
+        )?;
     }
-    println!(
+    writeln!(
+        text,
         "{:width$}  {:>9.3}          {:>9.1} at best   {:>7.1} at best",
         "all",
         1e3 * total,
         ceilings.gflops,
         ceilings.gbytes
-    );
+    )
 }
 
 /// Complete events of the trace event format (times in microseconds), the steps one after the other.
