@@ -5,24 +5,16 @@
 
 use anyhow::Context;
 use clap::Parser;
-use raygrad_benches::{Table, median, number_before, output, quick};
+use raygrad_benches::{Programs, Table, median, number_before, output, quick};
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::fmt::Write;
 use std::path::PathBuf;
-use std::process::Command;
 
 #[derive(Parser)]
 struct Args {
-    /// The command raygrad.
-    #[arg(long)]
-    raygrad: PathBuf,
-    /// Python with torch; where it or its GPU is missing, it is left out.
-    #[arg(long)]
-    python: PathBuf,
-    /// Folder of torch_step.py.
-    #[arg(long)]
-    peers: PathBuf,
+    #[command(flatten)]
+    programs: Programs,
     /// Folder of the result, `<device>.md`.
     #[arg(long)]
     out: PathBuf,
@@ -103,7 +95,8 @@ fn main() -> anyhow::Result<()> {
     if quick() {
         (args.rounds, args.devices) = (1, vec!["vulkan".into()]);
     }
-    let peers = if args.has_cuda() { &PEERS[..] } else { &[] };
+    let has_gpu = args.programs.has("PyTorch", "import torch; assert torch.cuda.is_available()");
+    let peers = if has_gpu { &PEERS[..] } else { &[] };
     let (mut text, mut device) = (String::new(), String::new());
     for work in &WORKS {
         let mut own: BTreeMap<&str, Vec<Bench>> = BTreeMap::new();
@@ -136,19 +129,10 @@ fn main() -> anyhow::Result<()> {
 }
 
 impl Args {
-    fn has_cuda(&self) -> bool {
-        let code = "import torch, sys; sys.exit(not torch.cuda.is_available())";
-        let there = Command::new(&self.python).args(["-c", code]).output().is_ok_and(|o| o.status.success());
-        if !there {
-            eprintln!("PyTorch is left out: {} finds none with a GPU", self.python.display());
-        }
-        there
-    }
-
     fn own(&self, work: &Work, device: &str) -> anyhow::Result<Bench> {
         let rows = if quick() { 64.0 } else { (work.rows * self.scale).round() };
-        let mut command = Command::new(&self.raygrad);
-        command.args(["bench", work.preset, "--json", "--launches", "--device", device]);
+        let mut command = self.programs.bench(work.preset);
+        command.args(["--launches", "--device", device]);
         command.args(["--set", &format!("{}={rows}", work.setting)]);
         if quick() {
             command.args(["--steps", "1", "--set", "field.layers=[16,16]"]);
@@ -163,8 +147,8 @@ impl Args {
 
     /// Seconds of a step in PyTorch, on as many points of a patch, or rays.
     fn peer(&self, work: &Work, rows: usize, options: &[&str]) -> anyhow::Result<f64> {
-        let mut command = Command::new(&self.python);
-        command.arg(self.peers.join("torch_step.py")).args(work.peer).arg(rows.to_string());
+        let mut command = self.programs.python();
+        command.arg(self.programs.script("torch_step.py")).args(work.peer).arg(rows.to_string());
         command.args(["--device", "cuda", "--iters", "20"]).args(options);
         number_before(&output(command)?, "s/step")
     }

@@ -4,23 +4,14 @@
 //! Speeds on a shared machine drift: every number is a median over rounds, and every ratio is taken within a round first.
 
 use clap::{Parser, ValueEnum};
-use raygrad_benches::{Table, median, number_before, output, quick};
+use raygrad_benches::{Programs, Table, median, number_before, output, quick};
 use serde::Deserialize;
-use std::path::{Path, PathBuf};
-use std::process::Command;
 
 #[derive(Parser)]
 struct Args {
     work: Work,
-    /// The command raygrad.
-    #[arg(long)]
-    raygrad: PathBuf,
-    /// Python with torch, jax and numpy; what it lacks is left out.
-    #[arg(long)]
-    python: PathBuf,
-    /// Folder of torch_step.py and jax_step.py.
-    #[arg(long)]
-    peers: PathBuf,
+    #[command(flatten)]
+    programs: Programs,
     #[arg(long, default_value_t = 5)]
     rounds: usize,
     /// Points of a patch, or rays of a step; by default 4096 and 200 (two of each of the scene's 100 views).
@@ -103,8 +94,8 @@ fn main() -> anyhow::Result<()> {
         (args.rounds, args.rows) = (1, Some(64));
     }
     let presets = args.work.presets();
-    let peers: Vec<(&str, &str)> =
-        [("PyTorch", "torch"), ("JAX", "jax")].into_iter().filter(|(_, module)| args.has(module)).collect();
+    let there = |(_, module): &(&str, &str)| args.programs.has(module, &format!("import {module}, numpy"));
+    let peers: Vec<(&str, &str)> = [("PyTorch", "torch"), ("JAX", "jax")].into_iter().filter(there).collect();
     let mut own: Vec<Vec<(Timed, f64)>> = vec![vec![]; presets.len()];
     let mut others: Vec<Vec<Timed>> = vec![vec![]; peers.len()];
     for round in 1..=args.rounds {
@@ -131,18 +122,9 @@ impl Args {
         self.rows.unwrap_or(self.work.rows())
     }
 
-    fn has(&self, module: &str) -> bool {
-        let found = Command::new(&self.python).args(["-c", &format!("import {module}, numpy")]).output();
-        let there = found.is_ok_and(|o| o.status.success());
-        if !there {
-            eprintln!("{module} is left out: {} cannot import it", self.python.display());
-        }
-        there
-    }
-
     fn own(&self, preset: &str) -> anyhow::Result<(Timed, f64)> {
-        let mut command = Command::new(&self.raygrad);
-        command.args(["bench", preset, "--json", "--device", "cpu", "--threads", &self.threads.to_string()]);
+        let mut command = self.programs.bench(preset);
+        command.args(["--device", "cpu", "--threads", &self.threads.to_string()]);
         command.args(["--set", &format!("{}={}", self.work.setting(), self.rows())]);
         if quick() {
             command.args(["--steps", "2"]);
@@ -156,8 +138,8 @@ impl Args {
     }
 
     fn peer(&self, module: &str) -> anyhow::Result<Timed> {
-        let script: &Path = &self.peers.join(format!("{module}_step.py"));
-        let mut command = Command::new(&self.python);
+        let script = self.programs.script(&format!("{module}_step.py"));
+        let mut command = self.programs.python();
         command.args(["-c", MEASURED]).arg(script).args(self.work.of_peers()).arg(self.rows().to_string());
         if module == "torch" {
             command.args(["--threads", &self.threads.to_string()]);

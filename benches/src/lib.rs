@@ -8,6 +8,7 @@ use raygrad::planar::Trainer;
 use raygrad::training::Training;
 use std::fmt::Display;
 use std::io::IsTerminal;
+use std::path::PathBuf;
 use std::process::Command;
 use std::time::Instant;
 
@@ -48,6 +49,47 @@ impl Display for Table {
             }
         }
         Ok(())
+    }
+}
+
+/// The programs that a comparison starts.
+#[derive(clap::Args)]
+pub struct Programs {
+    /// The command raygrad.
+    #[arg(long)]
+    raygrad: PathBuf,
+    /// Python with torch, jax and numpy; what it lacks is left out.
+    #[arg(long)]
+    python: PathBuf,
+    /// Folder of torch_step.py and jax_step.py.
+    #[arg(long)]
+    peers: PathBuf,
+}
+
+impl Programs {
+    /// `raygrad bench`, printing JSON.
+    pub fn bench(&self, preset: &str) -> Command {
+        let mut command = Command::new(&self.raygrad);
+        command.args(["bench", preset, "--json"]);
+        command
+    }
+
+    pub fn python(&self) -> Command {
+        Command::new(&self.python)
+    }
+
+    /// A script of the peers'.
+    pub fn script(&self, name: &str) -> PathBuf {
+        self.peers.join(name)
+    }
+
+    /// Whether Python runs some code without an error; if not, says that `what` is left out.
+    pub fn has(&self, what: &str, code: &str) -> bool {
+        let there = self.python().args(["-c", code]).output().is_ok_and(|o| o.status.success());
+        if !there {
+            eprintln!("{what} is left out: {} cannot `{code}`", self.python.display());
+        }
+        there
     }
 }
 

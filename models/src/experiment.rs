@@ -327,10 +327,6 @@ impl Experiment {
     }
 }
 
-#[cfg(test)]
-#[path = "experiment_tests.rs"]
-mod tests;
-
 /// Runs of fewer steps are not timed before they begin.
 const TRIED: usize = 50;
 /// Steps that are timed, or fewer if they take longer than so many seconds.
@@ -389,3 +385,7 @@ pub fn open_device(choice: DeviceChoice, threads: Option<usize>) -> Result<Devic
         DeviceChoice::Vulkan(index) => Device::vulkan(index),
     }
 }
+
+#[cfg(test)]
+#[path = "experiment_tests.rs"]
+mod tests;

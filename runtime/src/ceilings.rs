@@ -1,4 +1,4 @@
-//! What a device could do at best: to compare launches with.
+//! What a device could do at best: to compare steps and launches with.
 
 use crate::{Device, RunError, Session};
 use raygrad_compiler::ops::input::Role;
@@ -6,33 +6,27 @@ use raygrad_compiler::{Axis, Shape, Step, Tensor, compile};
 use raygrad_kernels::cpu::peak::peak_gflops;
 use std::time::Instant;
 
-/// Measured rates of a device.
-#[derive(Clone, Copy, Debug)]
-pub struct Ceilings {
-    /// 10^9 operations a second of multiply-adds in registers, each counted as two.
-    pub gflops: f64,
-    /// 10^9 bytes a second to and from memory, of a buffer that is read and written in place.
-    pub gbytes: f64,
-}
-
-/// Lanes of the buffer that passes through: 64 MiB, more than caches hold.
+/// Lanes of the buffer that passes through: more than caches hold.
 const LANES: usize = 16 << 20;
 const ROUNDS: usize = 5;
 
 impl Device {
-    /// Measures the rates, some tenths of a second. On the CPU multiply-adds are measured on as many threads as it has.
-    pub fn ceilings(&self) -> Result<Ceilings, RunError> {
-        let bytes = 8.0 * LANES as f64;
-        let gbytes = bytes / self.fastest(&copy())? * 1e-9;
-        let gflops = match self {
-            Device::Cpu { pool } => peak_gflops(pool.current_num_threads(), 150.0),
+    /// 10^9 operations a second of multiply-adds in registers, each counted as two; on the CPU on as many threads as it has.
+    /// Takes some tenths of a second.
+    pub fn peak_gflops(&self) -> Result<f64, RunError> {
+        match self {
+            Device::Cpu { pool } => Ok(peak_gflops(pool.current_num_threads(), 150.0)),
             #[cfg(feature = "gpu")]
             _ => {
                 let (step, operations) = multiply_adds();
-                operations / self.fastest(&step)? * 1e-9
+                Ok(operations / self.fastest(&step)? * 1e-9)
             }
-        };
-        Ok(Ceilings { gflops, gbytes })
+        }
+    }
+
+    /// 10^9 bytes a second to and from memory, of a buffer of 64 MiB that is read and written in place.
+    pub fn peak_gbytes(&self) -> Result<f64, RunError> {
+        Ok(8.0 * LANES as f64 / self.fastest(&copy())? * 1e-9)
     }
 
     /// Seconds of the fastest of some runs, by the device's clock where it has one.

@@ -16,7 +16,6 @@ pub mod vulkan;
 #[cfg(feature = "wgpu")]
 pub mod wgpu;
 
-pub use ceilings::Ceilings;
 pub use device::{Device, DeviceInfo};
 pub use error::{DeviceError, RunError};
 #[cfg(feature = "gpu")]

@@ -183,25 +183,9 @@ fn replaces_in_place(launches: &[Launch], value: BufferId, old: BufferId, buffer
             RegionOp::Linear(w) => w.buffer != old,
             _ => true,
         })
-        && (region.grain == region::Grain::Row || !mixes_channels_of(region, old));
+        && (region.grain == region::Grain::Row || region.keeps_channels_of(&[old], |_| true));
     let later = launches[writer + 1..].iter().any(|l| l.region.reads().contains(&old));
     whole && elementwise && !later
-}
-
-/// Whether a channel that a region computes depends on another channel of a buffer: it may be computed when that one has been
-/// replaced already.
-fn mixes_channels_of(region: &Region, buffer: BufferId) -> bool {
-    let mut depends = vec![false; region.body.len()];
-    for (at, inst) in region.body.iter().enumerate() {
-        let sources: Vec<usize> = inst.inputs.iter().map(|i| i.0 as usize).filter(|i| depends[*i]).collect();
-        let channelwise =
-            matches!(inst.op, RegionOp::Map(_)) && sources.iter().all(|i| region.body[*i].channels == inst.channels);
-        if !sources.is_empty() && !channelwise {
-            return true;
-        }
-        depends[at] = !sources.is_empty() || matches!(inst.op, RegionOp::Load(b) if b == buffer);
-    }
-    false
 }
 
 fn rename(launches: &mut [Launch], from: BufferId, to: BufferId) {

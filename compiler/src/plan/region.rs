@@ -176,6 +176,23 @@ impl Region {
         all.dedup();
         all
     }
+    /// Whether all channels stay apart in what depends on the given buffers: of the instructions that count, each computes a
+    /// channel from the same channel. Then whoever computes one channel may replace it.
+    pub fn keeps_channels_of(&self, buffers: &[BufferId], counts: impl Fn(usize) -> bool) -> bool {
+        let mut depends = vec![false; self.body.len()];
+        for (at, inst) in self.body.iter().enumerate().filter(|(at, _)| counts(*at)) {
+            depends[at] = matches!(&inst.op, RegionOp::Load(b) if buffers.contains(b));
+            for input in &inst.inputs {
+                if depends[input.0 as usize] {
+                    if !matches!(inst.op, RegionOp::Map(_)) || self.inst(*input).channels != inst.channels {
+                        return false;
+                    }
+                    depends[at] = true;
+                }
+            }
+        }
+        true
+    }
     /// Floating-point operations of one run.
     pub fn flops(&self) -> u64 {
         let per = |axes: &Axes| axes.elements() as u64;

@@ -130,7 +130,7 @@ fn components(region: &Region) -> Vec<Component> {
         let channels = region.inst(values[0]).channels;
         let possible = channels > 1
             && values.iter().all(|v| region.inst(*v).channels == channels && is_indexable(region, *v))
-            && stays_in_lane(region, &needed, &stores.iter().map(|s| written[*s]).collect::<Vec<_>>());
+            && region.keeps_channels_of(&stores.iter().map(|s| written[*s]).collect::<Vec<_>>(), |i| needed[i]);
         let by_lane = possible
             && if channels > WIDE {
                 lane < row.saturating_mul(4)
@@ -153,28 +153,6 @@ fn components(region: &Region) -> Vec<Component> {
         }
     }
     all
-}
-
-/// Whether every buffer that is replaced in place is only read in the lane that is written.
-fn stays_in_lane(region: &Region, needed: &[bool], written: &[raygrad_compiler::plan::region::BufferId]) -> bool {
-    // Per value, whether it depends on a replaced buffer; then all on the way must keep channels where they are.
-    let mut tainted = vec![false; region.body.len()];
-    for (at, inst) in region.body.iter().enumerate() {
-        if !needed[at] {
-            continue;
-        }
-        tainted[at] = matches!(&inst.op, RegionOp::Load(b) if written.contains(b));
-        for i in &inst.inputs {
-            if tainted[i.0 as usize] {
-                let aligned = matches!(inst.op, RegionOp::Map(_)) && region.inst(*i).channels == inst.channels;
-                if !aligned {
-                    return false;
-                }
-                tainted[at] = true;
-            }
-        }
-    }
-    true
 }
 
 /// Kernels for a region whose stores all write element by element.

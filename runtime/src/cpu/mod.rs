@@ -121,14 +121,14 @@ impl Executor for CpuExecutor {
     }
 
     fn run(&mut self, program: usize) -> Result<(), RunError> {
-        self.run_each(program, |_| {});
+        self.run_each(program, || {});
         Ok(())
     }
 
     fn profile(&mut self, program: usize) -> Result<Option<Vec<f64>>, RunError> {
         let mut seconds = vec![];
         let mut before = Instant::now();
-        self.run_each(program, |_| {
+        self.run_each(program, || {
             let now = Instant::now();
             seconds.push((now - std::mem::replace(&mut before, now)).as_secs_f64());
         });
@@ -143,8 +143,8 @@ impl Executor for CpuExecutor {
 }
 
 impl CpuExecutor {
-    /// Runs all launches; `done` hears the number of each.
-    fn run_each(&mut self, program: usize, mut done: impl FnMut(usize) + Send) {
+    /// Runs all launches; `done` is called after each.
+    fn run_each(&mut self, program: usize, mut done: impl FnMut() + Send) {
         let loaded = &mut self.programs[program];
         let buffers: Vec<*mut f32> = loaded.places.iter().map(|p| self.memory[*p].as_mut_ptr()).collect();
         let memory = Memory { buffers: &buffers };
@@ -152,14 +152,14 @@ impl CpuExecutor {
         let (packed, accumulators) = (&mut loaded.packed, &mut loaded.accumulators);
         let (launches, lanes) = (&loaded.launches, &loaded.lanes);
         self.pool.install(|| {
-            for (i, launch) in launches.iter().enumerate() {
+            for launch in launches {
                 for flat in &launch.flats {
                     run_flat(flat, memory, isa);
                 }
                 if let Some(tiles) = &launch.tiles {
                     run_launch(tiles, memory, isa, packed, accumulators, lanes);
                 }
-                done(i);
+                done();
             }
         });
     }

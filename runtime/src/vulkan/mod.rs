@@ -65,7 +65,7 @@ impl Api for VulkanApi {
     fn profile(&mut self, program: &Loaded) -> Result<Option<Vec<f64>>, RunError> {
         let Some(clock) = self.gpu.clock() else { return Ok(None) };
         let timed = Timed::new(program, clock)?;
-        self.queue.run(timed.commands)?;
+        self.queue.submit_and_wait(Some(timed.commands))?;
         timed.seconds().map(Some)
     }
 

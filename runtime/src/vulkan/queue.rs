@@ -60,14 +60,12 @@ impl Queue {
         }
     }
 
-    /// Fills a buffer with zeros.
+    /// Fills a buffer with zeros, and waits: if loading fails after this, the buffer goes, and nothing may need it then.
     pub fn zero(&mut self, buffer: &Buffer) -> Result<(), RunError> {
         let commands = self.record(0)?;
         // SAFETY: `commands` is being recorded, and the buffer may be copied to.
         unsafe { self.gpu.device.cmd_fill_buffer(commands, buffer.raw, 0, vk::WHOLE_SIZE, 0) };
-        // A write may follow: fills and copies of one command buffer are not in order by themselves.
-        self.barrier(commands);
-        self.gpu.check()
+        self.submit_and_wait(None)
     }
 
     /// Sets the bytes of a buffer from `first` on.
@@ -110,9 +108,7 @@ impl Queue {
             // The end of a submission does not make what it wrote visible to the host.
             self.gpu.device.cmd_pipeline_barrier(commands, copies, host, Default::default(), &seen, &[], &[]);
         }
-        let at = self.at;
-        self.submit(None)?;
-        self.wait(at)?;
+        self.submit_and_wait(None)?;
         let Some(back) = &mut self.back else { return Ok(vec![]) };
         Ok(bytemuck::pod_collect_to_vec(&back.bytes()?[..size as usize]))
     }
@@ -136,10 +132,10 @@ impl Queue {
         self.gpu.check()
     }
 
-    /// Submits a program and waits for it.
-    pub fn run(&mut self, program: vk::CommandBuffer) -> Result<(), RunError> {
+    /// The same, and waits for all of it.
+    pub fn submit_and_wait(&mut self, program: Option<vk::CommandBuffer>) -> Result<(), RunError> {
         let at = self.at;
-        self.submit(Some(program))?;
+        self.submit(program)?;
         self.wait(at)
     }
 

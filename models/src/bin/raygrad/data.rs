@@ -1,6 +1,6 @@
 //! `raygrad data`: what a scene's folder holds.
 
-use crate::progress;
+use crate::{print, progress};
 use clap::Args;
 use raygrad::Error;
 use raygrad::run::files::write_atomically;
@@ -45,14 +45,14 @@ pub fn run(args: &DataArgs) -> anyhow::Result<ExitCode> {
         other => Err(other),
     });
     let scene = loaded.map_err(Error::from)?;
-    print!("{}", summary(&scene));
+    print(&summary(&scene))?;
     if let Some(path) = &args.plot {
         let bytes = match path.extension().is_some_and(|e| e == "svg") {
             true => plot::svg(&scene).map_err(Error::from)?.into_bytes(),
             false => plot::png(&scene).map_err(Error::from)?,
         };
         write_atomically(path, &bytes).map_err(Error::from)?;
-        println!("plot          {}", path.display());
+        print(&format!("plot          {}\n", path.display()))?;
     }
     Ok(ExitCode::SUCCESS)
 }

@@ -1,6 +1,6 @@
 //! `raygrad explain`: what an experiment compiles to. Needs no device.
 
-use crate::{Choice, output_folder};
+use crate::{Choice, output_folder, print};
 use clap::{Args, ValueEnum};
 use raygrad::Experiment;
 use raygrad::planar::{PlanarData, PlanarModel};
@@ -69,19 +69,19 @@ pub fn run(args: &ExplainArgs) -> anyhow::Result<ExitCode> {
             for (name, bytes) in &files {
                 write_atomically(&folder.join(name), bytes).map_err(raygrad::Error::from)?;
             }
-            println!("{} files in {}", files.len(), folder.display());
+            print(&format!("{} files in {}\n", files.len(), folder.display()))?;
         }
         None => {
             for (name, bytes) in &files {
                 if files.len() > 1 {
-                    println!("// {name}");
+                    print(&format!("// {name}\n"))?;
                 }
-                print!("{}", String::from_utf8_lossy(bytes));
+                print(&String::from_utf8_lossy(bytes))?;
             }
         }
     }
     if args.timing {
-        timing(recorded, &program);
+        timing(recorded, &program)?;
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -141,12 +141,12 @@ fn graph(step: &Step) -> String {
     text
 }
 
-fn timing(recorded: Duration, program: &Program) {
+fn timing(recorded: Duration, program: &Program) -> anyhow::Result<()> {
     let t = &program.timing;
     let stages = [("record, differentiate", recorded), ("simplify", t.simplify), ("fuse", t.fuse), ("plan", t.plan)];
     for (stage, time) in stages {
-        println!("{stage:<22} {:8.2} ms", 1e3 * time.as_secs_f64());
+        print(&format!("{stage:<22} {:8.2} ms\n", 1e3 * time.as_secs_f64()))?;
     }
     let total: Duration = stages.iter().map(|s| s.1).sum();
-    println!("{:<22} {:8.2} ms", "total", 1e3 * total.as_secs_f64());
+    print(&format!("{:<22} {:8.2} ms\n", "total", 1e3 * total.as_secs_f64()))
 }

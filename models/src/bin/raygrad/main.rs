@@ -155,7 +155,7 @@ fn quiet_drivers() {
 
 fn devices() -> anyhow::Result<ExitCode> {
     for device in raygrad::Device::list() {
-        println!("{:<10} {}  ({}; {})", device.id, device.name, device.backend, device.details);
+        print(&format!("{:<10} {}  ({}; {})\n", device.id, device.name, device.backend, device.details))?;
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -163,7 +163,7 @@ fn devices() -> anyhow::Result<ExitCode> {
 fn presets() -> anyhow::Result<ExitCode> {
     let width = PRESETS.iter().map(|p| p.name.len()).max().unwrap_or(0);
     for preset in PRESETS {
-        println!("{:width$}  {}", preset.name, preset.summary());
+        print(&format!("{:width$}  {}\n", preset.name, preset.summary()))?;
     }
     Ok(ExitCode::SUCCESS)
 }

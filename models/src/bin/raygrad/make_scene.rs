@@ -1,6 +1,6 @@
 //! `raygrad make-scene`: the built-in scene as files.
 
-use crate::progress;
+use crate::{print, progress};
 use clap::Args;
 use raygrad::scene::make_scene::{MakeOptions, make_scene};
 use std::path::PathBuf;
@@ -27,6 +27,6 @@ pub fn run(args: &MakeSceneArgs) -> anyhow::Result<ExitCode> {
     let made = make_scene(&args.folder, &options, &|done, all| bar.show(done, all));
     bar.finish();
     made.map_err(raygrad::Error::from)?;
-    println!("a scene of {} training views in {}", args.views, args.folder.display());
+    print(&format!("a scene of {} training views in {}\n", args.views, args.folder.display()))?;
     Ok(ExitCode::SUCCESS)
 }

@@ -1,7 +1,7 @@
 //! `raygrad train`.
 
 use crate::progress::Progress;
-use crate::{Choice, listen};
+use crate::{Choice, listen, print};
 use clap::Args;
 use raygrad::Outcome;
 use std::path::PathBuf;
@@ -45,16 +45,15 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     }
     let stop = listen()?;
     let outcome = experiment.train_observed(&mut Progress::new(), &stop)?;
-    Ok(tell(&outcome))
+    tell(&outcome)
 }
 
-fn tell(outcome: &Outcome) -> ExitCode {
+fn tell(outcome: &Outcome) -> anyhow::Result<ExitCode> {
     let folder = outcome.folder.display();
     if outcome.interrupted {
-        println!("stopped; continue with the same command and `--out {folder} --resume`");
-        return ExitCode::from(130);
+        print(&format!("stopped; continue with the same command and `--out {folder} --resume`\n"))?;
+        return Ok(ExitCode::from(130));
     }
-    print!("{}", outcome.summary);
-    println!("results       {folder}/report.html");
-    ExitCode::SUCCESS
+    print(&format!("{}results       {folder}/report.html\n", outcome.summary))?;
+    Ok(ExitCode::SUCCESS)
 }
