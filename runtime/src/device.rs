@@ -3,6 +3,8 @@
 use crate::DeviceError;
 use raygrad_compiler::Target;
 use raygrad_kernels::cpu::Isa;
+#[cfg(feature = "gpu")]
+use raygrad_kernels::gpu::Half;
 use std::sync::Arc;
 
 /// A device to run sessions on.
@@ -12,10 +14,21 @@ pub enum Device {
     Cpu { pool: Arc<rayon::ThreadPool> },
     /// A GPU, or software that acts as one.
     #[cfg(feature = "wgpu")]
-    Wgpu { gpu: Arc<crate::wgpu::Gpu> },
+    Wgpu { gpu: Arc<crate::wgpu::Gpu>, half: Option<Half> },
     /// The same through Vulkan, with a device of raygrad's own.
     #[cfg(feature = "vulkan")]
-    Vulkan { gpu: Arc<crate::vulkan::Gpu> },
+    Vulkan { gpu: Arc<crate::vulkan::Gpu>, half: Option<Half> },
+}
+
+/// How precise a device computes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Precision {
+    /// Everything in single precision.
+    #[default]
+    F32,
+    /// Matrix products of halves, summed in single precision; what they read is stored as halves. Parameters, coordinates
+    /// and everything else stay in single precision.
+    Mixed,
 }
 
 /// A device as listed for people.
@@ -35,11 +48,11 @@ impl Device {
         if may_have_gpu() {
             #[cfg(feature = "wgpu")]
             if let Some(gpu) = crate::wgpu::Gpu::auto() {
-                return Ok(Device::Wgpu { gpu: Arc::new(gpu) });
+                return Ok(Device::Wgpu { gpu: Arc::new(gpu), half: None });
             }
             #[cfg(feature = "vulkan")]
             if let Some(gpu) = crate::vulkan::Gpu::auto() {
-                return Ok(Device::Vulkan { gpu: Arc::new(gpu) });
+                return Ok(Device::Vulkan { gpu: Arc::new(gpu), half: None });
             }
         }
         Device::cpu(threads)
@@ -48,7 +61,7 @@ impl Device {
     /// The adapter numbered `index` in [`Device::list`], or the best one, software included.
     #[cfg(feature = "wgpu")]
     pub fn wgpu(index: Option<usize>) -> Result<Device, DeviceError> {
-        Ok(Device::Wgpu { gpu: Arc::new(crate::wgpu::Gpu::open(index)?) })
+        Ok(Device::Wgpu { gpu: Arc::new(crate::wgpu::Gpu::open(index)?), half: None })
     }
 
     /// This build has no wgpu backend.
@@ -60,7 +73,7 @@ impl Device {
     /// The Vulkan driver numbered `index` in [`Device::list`], or the best one, software included.
     #[cfg(feature = "vulkan")]
     pub fn vulkan(index: Option<usize>) -> Result<Device, DeviceError> {
-        Ok(Device::Vulkan { gpu: Arc::new(crate::vulkan::Gpu::open(index)?) })
+        Ok(Device::Vulkan { gpu: Arc::new(crate::vulkan::Gpu::open(index)?), half: None })
     }
 
     /// This build has no Vulkan backend.
@@ -81,6 +94,62 @@ impl Device {
         Ok(Device::Cpu { pool: Arc::new(pool) })
     }
 
+    /// The same device at another precision. Cooperative matrices are used where the device has them and they pass a test
+    /// against single precision.
+    pub fn with_precision(self, precision: Precision) -> Result<Device, DeviceError> {
+        match (precision, &self) {
+            (Precision::F32, Device::Cpu { .. }) => Ok(self),
+            (Precision::Mixed, Device::Cpu { .. }) => Err(DeviceError::NoHalf { device: self.name() }),
+            #[cfg(feature = "gpu")]
+            (Precision::F32, _) => Ok(self.with_half(None)),
+            #[cfg(feature = "gpu")]
+            (Precision::Mixed, _) => {
+                let Some(half) = self.has_half() else { return Err(DeviceError::NoHalf { device: self.name() }) };
+                let mixed = self.with_half(Some(half));
+                if half.matrices.is_none() || crate::gpu::half::matrices_work(&mixed) {
+                    return Ok(mixed);
+                }
+                Ok(mixed.with_half(Some(Half { matrices: None })))
+            }
+        }
+    }
+
+    /// What the device has for half precision, if it stores halves.
+    #[cfg(feature = "gpu")]
+    pub fn has_half(&self) -> Option<Half> {
+        match self {
+            Device::Cpu { .. } => None,
+            #[cfg(feature = "wgpu")]
+            Device::Wgpu { gpu, .. } => gpu.half(),
+            #[cfg(feature = "vulkan")]
+            Device::Vulkan { gpu, .. } => gpu.half(),
+        }
+    }
+
+    /// The same device with what kernels may use for half precision.
+    #[cfg(feature = "gpu")]
+    pub fn with_half(self, half: Option<Half>) -> Device {
+        match self {
+            Device::Cpu { .. } => self,
+            #[cfg(feature = "wgpu")]
+            Device::Wgpu { gpu, .. } => Device::Wgpu { gpu, half },
+            #[cfg(feature = "vulkan")]
+            Device::Vulkan { gpu, .. } => Device::Vulkan { gpu, half },
+        }
+    }
+
+    /// What kernels use for half precision; `None` at single precision.
+    #[cfg(feature = "gpu")]
+    pub fn half(&self) -> Option<Half> {
+        match self {
+            Device::Cpu { .. } => None,
+            #[cfg(feature = "wgpu")]
+            Device::Wgpu { half, .. } => *half,
+            #[cfg(feature = "vulkan")]
+            Device::Vulkan { half, .. } => *half,
+        }
+    }
+
     /// What to compile programs for.
     pub fn target(&self) -> Target {
         match self {
@@ -97,9 +166,9 @@ impl Device {
         match self {
             Device::Cpu { pool } => format!("CPU, {} threads", pool.current_num_threads()),
             #[cfg(feature = "wgpu")]
-            Device::Wgpu { gpu } => gpu.adapter().name.clone(),
+            Device::Wgpu { gpu, .. } => gpu.adapter().name.clone(),
             #[cfg(feature = "vulkan")]
-            Device::Vulkan { gpu } => gpu.adapter().name.clone(),
+            Device::Vulkan { gpu, .. } => gpu.adapter().name.clone(),
         }
     }
 

@@ -11,6 +11,8 @@ pub enum DeviceError {
     NoVulkan(String),
     #[error("this build has no {0} backend (feature `{0}`)")]
     NotBuilt(&'static str),
+    #[error("{device} has no half precision that raygrad uses; `--precision f32` runs everywhere")]
+    NoHalf { device: String },
     #[error("cannot start {threads} threads: {reason}")]
     Threads { threads: usize, reason: String },
     #[error("the adapter `{name}` refused: {reason}")]

@@ -16,7 +16,7 @@ pub mod vulkan;
 #[cfg(feature = "wgpu")]
 pub mod wgpu;
 
-pub use device::{Device, DeviceInfo};
+pub use device::{Device, DeviceInfo, Precision};
 pub use error::{DeviceError, RunError};
 #[cfg(feature = "gpu")]
 pub use gpu::{Adapter, AdapterKind};

@@ -52,9 +52,9 @@ impl Session {
         let executor: Box<dyn Executor> = match device {
             Device::Cpu { pool } => Box::new(CpuExecutor::new(pool)),
             #[cfg(feature = "wgpu")]
-            Device::Wgpu { gpu } => Box::new(GpuExecutor::new(crate::wgpu::WgpuApi::new(gpu))),
+            Device::Wgpu { gpu, half } => Box::new(GpuExecutor::new(crate::wgpu::WgpuApi::new(gpu), half)),
             #[cfg(feature = "vulkan")]
-            Device::Vulkan { gpu } => Box::new(GpuExecutor::new(crate::vulkan::VulkanApi::new(gpu)?)),
+            Device::Vulkan { gpu, half } => Box::new(GpuExecutor::new(crate::vulkan::VulkanApi::new(gpu)?, half)),
         };
         Ok(Session { executor, programs: vec![], inputs: BTreeMap::new() })
     }

@@ -8,7 +8,8 @@ use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::reference::{Array, Bindings, evaluate};
 use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Step, compile};
-use raygrad_runtime::{Device, ProgramId, Session};
+use raygrad_kernels::gpu::Half;
+use raygrad_runtime::{Device, Precision, ProgramId, Session};
 use raygrad_tests::backend::compare;
 use raygrad_tests::{Rng, seed, total};
 
@@ -39,6 +40,13 @@ fn check(device: &Device, outputs: Vec<(&str, Tensor)>, tolerance: f64, what: &s
 
 /// A layer with bias and activation, its result and all gradients.
 fn layer(device: &Device, frames: usize, rows: usize, inputs: usize, outputs: usize, per_frame: bool) {
+    let (outputs_of, what) = layer_outputs(frames, rows, inputs, outputs, per_frame);
+    check(device, outputs_of, 2e-5, &what);
+}
+
+type Outputs = Vec<(&'static str, Tensor)>;
+
+fn layer_outputs(frames: usize, rows: usize, inputs: usize, outputs: usize, per_frame: bool) -> (Outputs, String) {
     let (frame, row) = (Axis::new("frame", frames), Axis::new("row", rows));
     let own: &[&Axis] = if per_frame { &[&frame] } else { &[] };
     let x = Tensor::data("x", Shape::new(&[&frame, &row], inputs));
@@ -50,8 +58,7 @@ fn layer(device: &Device, frames: usize, rows: usize, inputs: usize, outputs: us
     let gradients = grad(&loss, &[&x, &w, &b]);
     let outputs_of =
         vec![("y", y), ("dx", gradients[0].clone()), ("dw", gradients[1].clone()), ("db", gradients[2].clone())];
-    let what = format!("layer {frames}x{rows}, {inputs} to {outputs}, per frame: {per_frame}");
-    check(device, outputs_of, 2e-5, &what);
+    (outputs_of, format!("layer {frames}x{rows}, {inputs} to {outputs}, per frame: {per_frame}"))
 }
 
 fn layers_of_all_widths(device: &Device) {
@@ -61,6 +68,52 @@ fn layers_of_all_widths(device: &Device) {
     layer(device, 3, 100, 20, 40, true);
     layer(device, 1, 4096, 8, 8, false);
     layer(device, 5, 1, 64, 128, true);
+    // The largest tiles, and a column that they leave over.
+    layer(device, 2, 8200, 72, 257, false);
+    layer(device, 1, 16401, 257, 40, false);
+}
+
+/// A network's result and all gradients, so that what lies between layers is stored.
+fn network_outputs(rows: usize, widths: [usize; 4]) -> Outputs {
+    let row = Axis::new("row", rows);
+    let x = Tensor::parameter("x", Shape::new(&[&row], widths[0]));
+    let weight = |i: usize| Tensor::parameter(format!("w{i}"), Shape::new(&[], (widths[i], widths[i + 1])));
+    let bias = |i: usize| Tensor::parameter(format!("b{i}"), Shape::new(&[], widths[i + 1]));
+    let parameters = [x.clone(), weight(0), bias(0), weight(1), bias(1), weight(2)];
+    let [_, w0, b0, w1, b1, w2] = &parameters;
+    let hidden = (x.linear(w0) + b0).softplus(1.0).linear(w1) + b1;
+    let y = hidden.sin().linear(w2);
+    let up = Tensor::data("up", y.shape().clone());
+    let gradients = grad(&total(&(&y * up)), &parameters.iter().collect::<Vec<_>>());
+    let names = ["dx", "dw0", "db0", "dw1", "db1", "dw2"];
+    [vec![("y", y)], names.into_iter().zip(gradients).collect()].concat()
+}
+
+/// Everything that mixed precision has here: storing halves, and multiplying matrices of them.
+fn halves(device: &Device) {
+    let Some(half) = device.has_half() else {
+        println!("skipped: {} has no half precision", device.name());
+        return;
+    };
+    let mut variants = vec![Half { matrices: None }];
+    if half.matrices.is_some() {
+        let mixed = device.clone().with_precision(Precision::Mixed).unwrap();
+        assert_eq!(mixed.half(), Some(half), "cooperative matrices fail their test");
+        variants.push(half);
+    }
+    for half in variants {
+        println!("{}: {half:?}", device.name());
+        let device = device.clone().with_half(Some(half));
+        // Halves have 11 bits; of hundreds of products, some errors add up.
+        let all = [(2, 333, 34, 64, false), (2, 8200, 72, 257, false), (3, 100, 70, 40, true), (1, 4099, 257, 65, false)];
+        for (frames, rows, inputs, outputs, per_frame) in all {
+            let (outputs, what) = layer_outputs(frames, rows, inputs, outputs, per_frame);
+            check(&device, outputs, 3e-3, &format!("{what}, {half:?}"));
+        }
+        for (rows, widths) in [(333, [20, 40, 70, 3]), (9000, [63, 256, 128, 4])] {
+            check(&device, network_outputs(rows, widths), 6e-3, &format!("network {widths:?} of {rows}, {half:?}"));
+        }
+    }
 }
 
 fn reductions_of_all_sizes(device: &Device) {
@@ -257,12 +310,12 @@ fn narrow(device: &Device) -> Device {
         #[cfg(feature = "wgpu")]
         Device::Wgpu { .. } => {
             let gpu = raygrad_runtime::wgpu::Gpu::open(None).unwrap().with_max_binding(limit);
-            Device::Wgpu { gpu: gpu.into() }
+            Device::Wgpu { gpu: gpu.into(), half: None }
         }
         #[cfg(feature = "vulkan")]
         Device::Vulkan { .. } => {
             let gpu = raygrad_runtime::vulkan::Gpu::open(None).unwrap().with_max_binding(limit);
-            Device::Vulkan { gpu: gpu.into() }
+            Device::Vulkan { gpu: gpu.into(), half: None }
         }
     }
 }
@@ -314,6 +367,7 @@ macro_rules! on_every_backend {
 }
 on_every_backend!(
     layers_of_all_widths,
+    halves,
     reductions_of_all_sizes,
     gathers_and_scatters,
     compositing,

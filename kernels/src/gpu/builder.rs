@@ -7,6 +7,7 @@
 //!
 //! One file above 400 lines: all of it keeps the same few invariants of the block that is being written.
 
+use super::layout::Storage;
 use naga::{
     AddressSpace, ArraySize, BinaryOperator, Block, Expression, Function, GlobalVariable, Handle, Literal,
     LocalVariable, MathFunction, Module, Range, ResourceBinding, Scalar, ScalarKind, Span, Statement, StorageAccess,
@@ -15,10 +16,11 @@ use naga::{
 use raygrad_compiler::scalar::DType;
 use std::collections::HashMap;
 
-/// Scalar type of a value.
+/// Scalar type of a value. Halves are only stored and multiplied as matrices; everything else is computed in `F32`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Kind {
     F32,
+    F16,
     U32,
     Bool,
 }
@@ -28,6 +30,27 @@ impl From<DType> for Kind {
         match t {
             DType::F32 => Kind::F32,
             DType::U32 => Kind::U32,
+        }
+    }
+}
+
+impl From<Storage> for Kind {
+    fn from(s: Storage) -> Kind {
+        match s {
+            Storage::F32 => Kind::F32,
+            Storage::F16 => Kind::F16,
+            Storage::U32 => Kind::U32,
+        }
+    }
+}
+
+impl Kind {
+    fn scalar(self) -> Scalar {
+        match self {
+            Kind::F32 => Scalar::F32,
+            Kind::F16 => Scalar::F16,
+            Kind::U32 => Scalar::U32,
+            Kind::Bool => Scalar::BOOL,
         }
     }
 }
@@ -59,7 +82,33 @@ impl Var {
 pub struct Memory {
     pointer: Handle<Expression>,
     kind: Kind,
-    vector: bool,
+    /// Its elements are four lanes each.
+    pub vector: bool,
+}
+
+/// A factor of a product of cooperative matrices.
+#[derive(Clone, Copy, Debug)]
+pub struct Matrix(Handle<Expression>);
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Factor {
+    Left,
+    Right,
+}
+
+/// A sum of products of cooperative matrices.
+#[derive(Clone, Copy, Debug)]
+pub struct MatrixSum {
+    pointer: Handle<Expression>,
+}
+
+/// Where a cooperative matrix lies: lines of so many elements of memory, from element `first` on. Lines are rows or columns.
+#[derive(Clone, Copy, Debug)]
+pub struct MatrixAt {
+    pub memory: Memory,
+    pub first: Value,
+    pub line: u32,
+    pub row_major: bool,
 }
 
 /// Key of a pure expression; equal ones are built once a block.
@@ -69,7 +118,7 @@ enum Pure {
     Binary(BinaryOperator, Handle<Expression>, Handle<Expression>),
     Math(MathFunction, Handle<Expression>, Option<Handle<Expression>>, Option<Handle<Expression>>),
     Select(Handle<Expression>, Handle<Expression>, Handle<Expression>),
-    As(Handle<Expression>, ScalarKind, bool),
+    As(Handle<Expression>, Kind, bool),
     Splat(Handle<Expression>),
     Component(Handle<Expression>, u32),
 }
@@ -96,6 +145,8 @@ pub struct Builder {
     frames: Vec<Scope>,
     scopes: u32,
     literals: HashMap<(Kind, u32), Value>,
+    /// Floats that were converted from halves, with what they were.
+    halves: HashMap<Handle<Expression>, Value>,
     types: HashMap<(Kind, bool), Handle<Type>>,
     /// What values are called that are used more than once and have no name of their own.
     topics: Vec<String>,
@@ -114,6 +165,7 @@ impl Builder {
             frames: vec![Scope { id: 0, frame: Frame::Body, block: Block::new(), pure: HashMap::new() }],
             scopes: 1,
             literals: HashMap::new(),
+            halves: HashMap::new(),
             types: HashMap::new(),
             topics: vec!["value".into()],
             topic_of: vec![],
@@ -127,11 +179,7 @@ impl Builder {
     // Types and memory.
 
     fn ty(&mut self, kind: Kind, vector: bool) -> Handle<Type> {
-        let scalar = match kind {
-            Kind::F32 => Scalar::F32,
-            Kind::U32 => Scalar::U32,
-            Kind::Bool => Scalar::BOOL,
-        };
+        let scalar = kind.scalar();
         let inner =
             if vector { TypeInner::Vector { size: VectorSize::Quad, scalar } } else { TypeInner::Scalar(scalar) };
         let types = &mut self.module.types;
@@ -140,17 +188,18 @@ impl Builder {
 
     fn array(&mut self, kind: Kind, vector: bool, size: ArraySize) -> Handle<Type> {
         let base = self.ty(kind, vector);
-        let inner = TypeInner::Array { base, size, stride: if vector { 16 } else { 4 } };
+        let stride = u32::from(kind.scalar().width) * if vector { 4 } else { 1 };
+        let inner = TypeInner::Array { base, size, stride };
         self.module.types.insert(Type { name: None, inner }, Span::UNDEFINED)
     }
 
-    /// A read-only storage buffer, bound in the order of these calls.
-    pub fn storage(&mut self, name: &str, kind: Kind) -> Memory {
-        let ty = self.array(kind, false, ArraySize::Dynamic);
+    /// A read-only storage buffer, bound in the order of these calls, of single lanes or of vectors of four.
+    pub fn storage(&mut self, name: &str, kind: Kind, vector: bool) -> Memory {
+        let ty = self.array(kind, vector, ArraySize::Dynamic);
         let access = StorageAccess::LOAD;
         let binding = Some(ResourceBinding { group: 0, binding: self.bindings });
         self.bindings += 1;
-        self.global(name, AddressSpace::Storage { access }, binding, ty, kind, false)
+        self.global(name, AddressSpace::Storage { access }, binding, ty, kind, vector)
     }
 
     /// Allows writing to a storage buffer.
@@ -218,23 +267,127 @@ impl Builder {
         handle
     }
 
-    pub fn load(&mut self, memory: Memory, index: Value) -> Value {
-        let pointer = self.at(memory, index);
-        let handle = self.emit(Expression::Load { pointer });
-        Value { handle, kind: memory.kind, vector: memory.vector }
+    /// One lane of memory whose elements may be vectors.
+    fn at_lane(&mut self, memory: Memory, lane: Value) -> Handle<Expression> {
+        if !memory.vector {
+            return self.at(memory, lane);
+        }
+        let four = self.u(4);
+        let (element, component) = (self.div(lane, four), self.rem(lane, four));
+        let base = self.at(memory, element);
+        let handle = self.emit(Expression::Access { base, index: component.handle });
+        self.pointers[handle.index()] = true;
+        handle
     }
 
+    /// An element of memory; halves become floats.
+    pub fn load(&mut self, memory: Memory, index: Value) -> Value {
+        let pointer = self.at(memory, index);
+        self.loaded(pointer, memory.kind, memory.vector)
+    }
+
+    /// One lane of memory; of halves, as a float.
+    pub fn load_lane(&mut self, memory: Memory, lane: Value) -> Value {
+        let pointer = self.at_lane(memory, lane);
+        self.loaded(pointer, memory.kind, false)
+    }
+
+    fn loaded(&mut self, pointer: Handle<Expression>, kind: Kind, vector: bool) -> Value {
+        let handle = self.emit(Expression::Load { pointer });
+        let raw = Value { handle, kind, vector };
+        if kind != Kind::F16 {
+            return raw;
+        }
+        let value = self.convert(raw, Kind::F32);
+        self.halves.insert(value.handle, raw);
+        value
+    }
+
+    /// Sets an element of memory; floats become halves where it holds those.
     pub fn store(&mut self, memory: Memory, index: Value, value: Value) {
-        debug_assert_eq!((memory.kind, memory.vector), (value.kind, value.vector));
+        debug_assert_eq!(memory.vector, value.vector);
+        let value = self.stored_as(memory, value);
         let pointer = self.at(memory, index);
         self.push(Statement::Store { pointer, value: value.handle });
+    }
+
+    /// Sets one lane of memory.
+    pub fn store_lane(&mut self, memory: Memory, lane: Value, value: Value) {
+        debug_assert!(!value.vector);
+        let value = self.stored_as(memory, value);
+        let pointer = self.at_lane(memory, lane);
+        self.push(Statement::Store { pointer, value: value.handle });
+    }
+
+    fn stored_as(&mut self, memory: Memory, value: Value) -> Value {
+        let value = if memory.kind == Kind::F16 { self.half(value) } else { value };
+        debug_assert_eq!(memory.kind, value.kind);
+        value
+    }
+
+    /// A float as a half: the one that it was converted from, if it was.
+    pub fn half(&mut self, value: Value) -> Value {
+        match self.halves.get(&value.handle) {
+            _ if value.kind == Kind::F16 => value,
+            Some(raw) => *raw,
+            None => self.convert(value, Kind::F16),
+        }
+    }
+
+    // Cooperative matrices.
+
+    /// A sum of products of matrices, zero at first.
+    pub fn matrix_sum(&mut self, name: &str, side: u32) -> MatrixSum {
+        let inner = TypeInner::CooperativeMatrix {
+            columns: cooperative_size(side),
+            rows: cooperative_size(side),
+            scalar: Scalar::F32,
+            role: naga::CooperativeRole::C,
+        };
+        let ty = self.module.types.insert(Type { name: None, inner }, Span::UNDEFINED);
+        let variable = LocalVariable { name: Some(name.into()), ty, init: None };
+        let variable = self.function.local_variables.append(variable, Span::UNDEFINED);
+        let pointer = self.free(Expression::LocalVariable(variable));
+        let zeros = self.free(Expression::ZeroValue(ty));
+        self.push(Statement::Store { pointer, value: zeros });
+        MatrixSum { pointer }
+    }
+
+    /// The left (`M x K`) or right (`K x N`) factor of a product, from workgroup memory of halves.
+    pub fn matrix(&mut self, factor: Factor, side: u32, at: MatrixAt) -> Matrix {
+        let role = match factor {
+            Factor::Left => naga::CooperativeRole::A,
+            Factor::Right => naga::CooperativeRole::B,
+        };
+        let data = self.matrix_data(at);
+        let (columns, rows) = (cooperative_size(side), cooperative_size(side));
+        Matrix(self.emit(Expression::CooperativeLoad { columns, rows, role, data }))
+    }
+
+    pub fn matrix_multiply_add(&mut self, a: Matrix, b: Matrix, sum: MatrixSum) {
+        let c = self.emit(Expression::Load { pointer: sum.pointer });
+        let value = self.emit(Expression::CooperativeMultiplyAdd { a: a.0, b: b.0, c });
+        self.push(Statement::Store { pointer: sum.pointer, value });
+    }
+
+    /// Writes a sum to workgroup memory of floats.
+    pub fn matrix_store(&mut self, sum: MatrixSum, at: MatrixAt) {
+        let target = self.emit(Expression::Load { pointer: sum.pointer });
+        let data = self.matrix_data(at);
+        self.push(Statement::CooperativeStore { target, data });
+    }
+
+    fn matrix_data(&mut self, at: MatrixAt) -> naga::CooperativeData {
+        let stride = self.u(at.line);
+        let pointer = self.at(at.memory, at.first);
+        naga::CooperativeData { pointer, stride: stride.handle, row_major: at.row_major }
     }
 
     // Values.
 
     /// A built-in input of the entry point.
     pub fn built_in(&mut self, name: &str, what: naga::BuiltIn) -> Value {
-        let three = !matches!(what, naga::BuiltIn::LocalInvocationIndex);
+        let three = !matches!(what, naga::BuiltIn::LocalInvocationIndex | naga::BuiltIn::SubgroupId);
         let inner = TypeInner::Vector { size: VectorSize::Tri, scalar: Scalar::U32 };
         let ty = match three {
             true => self.module.types.insert(Type { name: None, inner }, Span::UNDEFINED),
@@ -271,6 +424,7 @@ impl Builder {
             Kind::F32 => Literal::F32(f32::from_bits(bits)),
             Kind::U32 => Literal::U32(bits),
             Kind::Bool => Literal::Bool(bits != 0),
+            Kind::F16 => unreachable!("constants are floats"),
         };
         let handle = self.free(Expression::Literal(literal));
         let value = Value { handle, kind, vector: false };
@@ -416,12 +570,13 @@ impl Builder {
 
     fn cast(&mut self, v: Value, to: Kind, convert: bool) -> Value {
         let kind = match to {
-            Kind::F32 => ScalarKind::Float,
+            Kind::F32 | Kind::F16 => ScalarKind::Float,
             Kind::U32 => ScalarKind::Uint,
             Kind::Bool => ScalarKind::Bool,
         };
-        let e = Expression::As { expr: v.handle, kind, convert: convert.then_some(4) };
-        self.pure(Pure::As(v.handle, kind, convert), e, to, v.vector)
+        let width = if to == Kind::F16 { 2 } else { 4 };
+        let e = Expression::As { expr: v.handle, kind, convert: convert.then_some(width) };
+        self.pure(Pure::As(v.handle, to, convert), e, to, v.vector)
     }
 
     // Statements.
@@ -571,6 +726,10 @@ impl Builder {
         });
         self.module
     }
+}
+
+fn cooperative_size(side: u32) -> naga::CooperativeSize {
+    if side == 8 { naga::CooperativeSize::Eight } else { naga::CooperativeSize::Sixteen }
 }
 
 fn fixed(size: u32) -> ArraySize {

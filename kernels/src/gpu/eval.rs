@@ -6,10 +6,10 @@
 
 use super::builder::{Memory, Value};
 use super::channels::{Linear, Run, affine, is_indexable, runs_of, sequence};
-use super::memory::{Emit, Position, kind};
+use super::memory::{Emit, Position, is_run, kind};
 use super::{eigen, scalar};
 use naga::BinaryOperator as Op;
-use raygrad_compiler::graph::Axis;
+use raygrad_compiler::graph::{Axes, Axis};
 use raygrad_compiler::plan::region::{BufferId, InstId, Region, RegionOp, Weights};
 use raygrad_compiler::scalar::DType;
 use std::collections::HashMap;
@@ -35,6 +35,8 @@ impl Channel {
 pub(super) struct Values<'r> {
     region: &'r Region,
     at: Vec<Position>,
+    /// Axes along which the four positions neighbour, the first at a multiple of four.
+    neighbours: Option<Axes>,
     /// Values with the block they were built in.
     known: HashMap<(InstId, Channel), (Value, u32)>,
     eigen: HashMap<InstId, (Memory, u32)>,
@@ -50,11 +52,19 @@ impl<'r> Values<'r> {
         Values {
             region,
             at,
+            neighbours: None,
             known: HashMap::new(),
             eigen: HashMap::new(),
             stored: HashMap::new(),
             shifted: HashMap::new(),
         }
+    }
+
+    /// Says that the positions are four neighbours in `rows`, the first at a multiple of four, so that a kernel `with_vectors`
+    /// loads them at once.
+    pub fn side_by_side(mut self, rows: &Axes) -> Values<'r> {
+        self.neighbours = Some(rows.clone());
+        self
     }
 
     /// Reads the given scans from memory unless they are given.
@@ -150,8 +160,13 @@ impl<'r> Values<'r> {
 
     /// A channel of a buffer where the positions are.
     fn load(&mut self, e: &mut Emit, buffer: BufferId, channel: Channel) -> Value {
-        let axes = e.layout.shape(buffer).axes.clone();
+        let (axes, dtype) = (e.layout.shape(buffer).axes.clone(), e.layout.shape(buffer).dtype);
         let channel = channel.value(e);
+        if dtype == DType::F32 && self.neighbours.as_ref().is_some_and(|rows| is_run(&axes, rows)) {
+            let element = self.at[0].element(e, &axes);
+            let at = e.index(buffer, channel, element);
+            return e.load_four(buffer, at);
+        }
         self.gather(e, |e, position| {
             let element = position.element(e, &axes);
             (buffer, e.index(buffer, channel, element))

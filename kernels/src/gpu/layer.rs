@@ -3,21 +3,23 @@
 use super::builder::Value;
 use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
-use super::memory::{Emit, Position};
-use super::tile::{Along, Tile, multiply};
+use super::memory::{Emit, Position, is_run};
+use super::tile::{Along, Operand, Tile, multiply, split};
 use super::{Kernel, LowerError};
 use naga::MathFunction as Math;
 use raygrad_compiler::graph::Axes;
 use raygrad_compiler::plan::region::{BufferId, InstId, Region, RegionOp, Weights};
+use raygrad_compiler::scalar::DType;
+use std::ops::Range;
 
-/// The kernel of a region whose stores all write the layer `linear` or what follows from it channel by channel.
-pub(super) fn kernel(
+/// The kernels of a region whose stores all write the layer `linear` or what follows from it channel by channel.
+pub(super) fn kernels(
     layout: &Layout,
     limits: Limits,
     name: &str,
     region: &Region,
     linear: InstId,
-) -> Result<Kernel, LowerError> {
+) -> Result<Vec<Kernel>, LowerError> {
     let inst = region.inst(linear);
     let (RegionOp::Linear(weights), RegionOp::Load(input)) = (&inst.op, &region.inst(inst.inputs[0]).op) else {
         unreachable!("the part of a layer holds a layer of a loaded input")
@@ -27,19 +29,28 @@ pub(super) fn kernel(
     // One matrix for every element of the weights' axes; the rows are the other axes.
     let batch_axes = layout.shape(weights.buffer).axes.clone();
     let row_axes = region.domain.minus(&batch_axes);
-    let layer = Layer {
-        region,
-        linear,
-        weights: *weights,
-        input: *input,
-        tile: Tile::of(columns, terms),
-        rows: row_axes.elements() as u32,
-        terms: terms as u32,
-        columns: columns as u32,
-        batch_axes,
-        row_axes,
-    };
-    layer.kernel(layout, limits, name)
+    let stretches = split(columns);
+    let several = stretches.len() > 1;
+    let mut all = vec![];
+    for (i, stretch) in stretches.into_iter().enumerate() {
+        let name = if several { format!("{name}.{}", i + 1) } else { name.to_string() };
+        let rows = row_axes.elements();
+        let layer = Layer {
+            region,
+            linear,
+            weights: *weights,
+            input: *input,
+            tile: Tile::of(&limits, (rows, stretch.len(), terms), batch_axes.elements()),
+            rows: rows as u32,
+            terms: terms as u32,
+            columns: stretch.start as u32..stretch.end as u32,
+            layer_columns: columns as u32,
+            batch_axes: batch_axes.clone(),
+            row_axes: row_axes.clone(),
+        };
+        all.push(layer.kernel(layout, limits, &name)?);
+    }
+    Ok(all)
 }
 
 struct Layer<'r> {
@@ -50,7 +61,9 @@ struct Layer<'r> {
     tile: Tile,
     rows: u32,
     terms: u32,
-    columns: u32,
+    /// Of the layer, which this kernel computes.
+    columns: Range<u32>,
+    layer_columns: u32,
     batch_axes: Axes,
     row_axes: Axes,
 }
@@ -58,9 +71,10 @@ struct Layer<'r> {
 impl Layer<'_> {
     fn kernel(&self, layout: &Layout, limits: Limits, name: &str) -> Result<Kernel, LowerError> {
         let tile = self.tile;
-        let (row_tiles, column_tiles) = (self.rows.div_ceil(tile.m), self.columns.div_ceil(tile.n));
+        let count = self.columns.end - self.columns.start;
+        let (row_tiles, column_tiles) = (self.rows.div_ceil(tile.m), count.div_ceil(tile.n));
         let groups = self.batch_axes.elements() as u64 * row_tiles as u64 * column_tiles as u64;
-        let mut e = Emit::new(layout, limits, groups, tile.invocations())?;
+        let mut e = Emit::new(layout, limits, groups, tile.invocations())?.with_vectors();
         if e.spare_workgroups() {
             e.leave_from(e.workgroup, groups as u32);
         }
@@ -71,59 +85,70 @@ impl Layer<'_> {
         let (row_tile, batch) = (e.b.rem(rest, down), e.b.div(rest, down));
         let (m, n) = (e.b.u(tile.m), e.b.u(tile.n));
         let (first_row, first_column) = (e.b.mul(row_tile, m), e.b.mul(column_tile, n));
+        let before = e.b.u(self.columns.start);
+        let first_column = e.b.add(first_column, before);
         e.b.name(first_row, "first_row");
         e.b.name(first_column, "first_column");
         e.b.name(batch, "batch");
 
         let (from, to) = (e.b.u(0), e.b.u(self.terms));
-        let block = multiply(
+        let along = if self.weights.transposed { Along::K } else { Along::Edge };
+        multiply(
             &mut e,
             tile,
             (from, to),
-            (&mut |e, k, at| self.input_vector(e, batch, first_row, k, at), Along::Edge),
-            (
-                &mut |e, k, at| self.weight_vector(e, batch, first_column, k, at),
-                if self.weights.transposed { Along::K } else { Along::Edge },
-            ),
+            Operand { along: Along::Edge, load: &mut |e, k, at| self.input_vector(e, batch, first_row, k, at) },
+            Operand { along, load: &mut |e, k, at| self.weight_vector(e, batch, first_column, k, at) },
+            &mut |e, at, sums| {
+                let row = e.b.add(first_row, at);
+                e.b.name(row, "row");
+                let positions = self.positions(e, batch, row);
+                let elements: Vec<Value> = positions.iter().map(|p| p.element(e, &self.region.domain)).collect();
+                let mut values = Values::new(self.region, positions);
+                if self.in_fours() {
+                    values = values.side_by_side(&self.row_axes);
+                }
+                for (at, sum) in sums {
+                    let column = e.b.add(first_column, *at);
+                    e.b.name(column, "column");
+                    let whole = count.is_multiple_of(tile.n);
+                    if !whole {
+                        let end = e.b.u(self.columns.end);
+                        let inside = e.b.less(column, end);
+                        e.b.open_if(inside);
+                    }
+                    values.give(e, self.linear, Channel::Var(column), *sum);
+                    if self.layer_columns == 1 {
+                        values.give(e, self.linear, Channel::At(0), *sum);
+                    }
+                    self.write(e, &mut values, column, row, &elements);
+                    if !whole {
+                        e.b.close_if();
+                    }
+                }
+            },
         );
-        for i in 0..tile.own_m / 4 {
-            let at = block.m(&mut e, i);
-            let row = e.b.add(first_row, at);
-            e.b.name(row, "row");
-            let positions = self.positions(&mut e, batch, row);
-            let elements: Vec<Value> = positions.iter().map(|p| p.element(&mut e, &self.region.domain)).collect();
-            let mut values = Values::new(self.region, positions);
-            for j in 0..tile.own_n {
-                let at = block.n(&mut e, j);
-                let column = e.b.add(first_column, at);
-                e.b.name(column, "column");
-                let whole = self.columns.is_multiple_of(tile.n);
-                if !whole {
-                    let columns = e.b.u(self.columns);
-                    let inside = e.b.less(column, columns);
-                    e.b.open_if(inside);
-                }
-                let sum = block.sum(&mut e, i, j);
-                values.give(&e, self.linear, Channel::Var(column), sum);
-                if self.columns == 1 {
-                    values.give(&e, self.linear, Channel::At(0), sum);
-                }
-                self.write(&mut e, &mut values, column, row, &elements);
-                if !whole {
-                    e.b.close_if();
-                }
-            }
-        }
         e.finish(name)
+    }
+
+    /// Whether four neighbouring rows from a multiple of four on all exist or all do not.
+    fn in_fours(&self) -> bool {
+        self.rows.is_multiple_of(4)
     }
 
     /// Four neighbouring rows, those past the end clamped to the last.
     fn positions(&self, e: &mut Emit, batch: Value, first: Value) -> Vec<Position> {
+        let clamped = !self.rows.is_multiple_of(self.tile.m);
         let mut all = vec![];
+        let mut first = first;
+        if clamped && self.in_fours() {
+            let last = e.b.u(self.rows - 4);
+            first = e.b.math(Math::Min, &[first, last]);
+        }
         for i in 0..4 {
             let offset = e.b.u(i);
             let mut row = e.b.add(first, offset);
-            if !self.rows.is_multiple_of(self.tile.m) {
+            if clamped && !self.in_fours() {
                 let last = e.b.u(self.rows - 1);
                 row = e.b.math(Math::Min, &[row, last]);
             }
@@ -146,15 +171,21 @@ impl Layer<'_> {
         let positions = self.positions(e, batch, row);
         let axes = e.layout.shape(self.input).axes.clone();
         let (channel, inside) = self.term(e, k);
-        let lanes: Vec<Value> = positions
-            .iter()
-            .map(|p| {
-                let element = p.element(e, &axes);
-                let at = e.index(self.input, channel, element);
-                e.load(self.input, at)
-            })
-            .collect();
-        let vector = e.b.vector([lanes[0], lanes[1], lanes[2], lanes[3]]);
+        let index = |e: &mut Emit, p: &Position| {
+            let element = p.element(e, &axes);
+            e.index(self.input, channel, element)
+        };
+        let vector = if self.in_fours() && is_run(&axes, &self.row_axes) {
+            let at = index(e, &positions[0]);
+            e.load_four(self.input, at)
+        } else {
+            let mut lanes = vec![];
+            for p in &positions {
+                let at = index(e, p);
+                lanes.push(e.load(self.input, at));
+            }
+            e.b.vector([lanes[0], lanes[1], lanes[2], lanes[3]])
+        };
         match inside {
             Some(inside) => {
                 let zero = e.b.f(0.0);
@@ -173,24 +204,39 @@ impl Layer<'_> {
         (e.b.math(Math::Min, &[k, last]), Some(e.b.less(k, count)))
     }
 
-    /// Weights of term `k` for four neighbouring columns, those past the end clamped to the last.
+    /// Four neighbouring weights of term `k`, or of transposed ones, of four neighbouring terms; past the end, any.
     fn weight_vector(&self, e: &mut Emit, batch: Value, first_column: Value, k: Value, at: Value) -> Value {
         e.b.topic("weight");
         let w = self.weights;
-        let (k, _) = self.term(e, k);
+        let column = e.b.add(first_column, at);
+        // The matrix is `w.rows` lines of `w.columns` weights; a transposed one has a line a column of the layer.
+        let (line, lines, first, ends) = if w.transposed {
+            (column, self.columns.end, k, (self.terms, self.terms.is_multiple_of(self.tile.k)))
+        } else {
+            let whole = (self.columns.end - self.columns.start).is_multiple_of(self.tile.n);
+            (k, self.terms, column, (self.columns.end, whole))
+        };
+        let last = e.b.u(lines - 1);
+        let line = e.b.math(Math::Min, &[line, last]);
+        let stride = e.b.u(w.columns as u32);
+        let before = e.b.u(w.first as u32);
+        let line = e.b.mul(line, stride);
+        let line = e.b.add(line, before);
+        let (end, whole) = ends;
+        let single = e.layout.shape(w.buffer).axes.elements() == 1;
+        let aligned = [w.first as u32, w.columns as u32, self.columns.start, end].iter().all(|x| x.is_multiple_of(4));
+        if single && aligned {
+            let last = e.b.u(end - 4);
+            let first = if whole { first } else { e.b.math(Math::Min, &[first, last]) };
+            let at = e.b.add(line, first);
+            return e.load_four(w.buffer, at);
+        }
         let mut lanes = vec![];
         for j in 0..4 {
-            let (offset, first) = (e.b.u(j), e.b.add(first_column, at));
-            let mut column = e.b.add(first, offset);
-            if !self.columns.is_multiple_of(self.tile.n) {
-                let last = e.b.u(self.columns - 1);
-                column = e.b.math(Math::Min, &[column, last]);
-            }
-            let (row, column) = if w.transposed { (column, k) } else { (k, column) };
-            let stride = e.b.u(w.columns as u32);
-            let row = e.b.mul(row, stride);
-            let (channel, first) = (e.b.add(row, column), e.b.u(w.first as u32));
-            let channel = e.b.add(channel, first);
+            let (offset, last) = (e.b.u(j), e.b.u(end - 1));
+            let own = e.b.add(first, offset);
+            let own = if whole { own } else { e.b.math(Math::Min, &[own, last]) };
+            let channel = e.b.add(line, own);
             let at = e.index(w.buffer, channel, batch);
             lanes.push(e.load(w.buffer, at));
         }
@@ -205,31 +251,50 @@ impl Layer<'_> {
             .iter()
             .map(|s| (s.buffer(), values.channel(e, s.values()[0], Channel::Var(column))))
             .collect();
-        let aligned = self.rows.is_multiple_of(4);
         let certain = self.rows.is_multiple_of(self.tile.m);
-        if aligned && !certain {
-            let rows = e.b.u(self.rows);
-            let inside = e.b.less(row, rows);
-            e.b.open_if(inside);
-        }
-        for (lane, element) in elements.iter().enumerate() {
-            if !aligned {
-                let (offset, rows) = (e.b.u(lane as u32), e.b.u(self.rows));
-                let own = e.b.add(row, offset);
-                let inside = e.b.less(own, rows);
+        if self.in_fours() {
+            if !certain {
+                let rows = e.b.u(self.rows);
+                let inside = e.b.less(row, rows);
                 e.b.open_if(inside);
             }
             for (buffer, result) in &results {
-                let value = if result.vector { e.b.component(*result, lane as u32) } else { *result };
-                let at = e.index(*buffer, column, *element);
-                e.store(*buffer, at, value);
+                let floats = e.layout.shape(*buffer).dtype == DType::F32;
+                if floats && is_run(&self.region.domain, &self.row_axes) {
+                    let at = e.index(*buffer, column, elements[0]);
+                    e.store_four(*buffer, at, *result);
+                    continue;
+                }
+                for (lane, element) in elements.iter().enumerate() {
+                    self.write_lane(e, (*buffer, *result), column, (lane as u32, *element));
+                }
             }
-            if !aligned {
+            if !certain {
                 e.b.close_if();
             }
+            return;
         }
-        if aligned && !certain {
+        for (lane, element) in elements.iter().enumerate() {
+            let (offset, rows) = (e.b.u(lane as u32), e.b.u(self.rows));
+            let own = e.b.add(row, offset);
+            let inside = e.b.less(own, rows);
+            e.b.open_if(inside);
+            for result in &results {
+                self.write_lane(e, *result, column, (lane as u32, *element));
+            }
             e.b.close_if();
         }
+    }
+
+    fn write_lane(
+        &self,
+        e: &mut Emit,
+        (buffer, result): (BufferId, Value),
+        column: Value,
+        (lane, element): (u32, Value),
+    ) {
+        let value = if result.vector { e.b.component(result, lane) } else { result };
+        let at = e.index(buffer, column, element);
+        e.store(buffer, at, value);
     }
 }

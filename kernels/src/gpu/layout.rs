@@ -7,7 +7,7 @@
 use super::LowerError;
 use raygrad_compiler::graph::Shape;
 use raygrad_compiler::ops::input::Role;
-use raygrad_compiler::plan::region::BufferId;
+use raygrad_compiler::plan::region::{BufferId, Inst, InstId, Region, RegionOp, Store};
 use raygrad_compiler::plan::{BufferKind, Program};
 use raygrad_compiler::scalar::DType;
 use std::collections::BTreeMap;
@@ -16,7 +16,7 @@ use std::ops::Range;
 /// Buffers start at multiples of this many lanes: 256 bytes, which suits every device's copies and cache lines.
 const ALIGN: u64 = 64;
 
-/// What a device can do.
+/// What kernels may use of a device.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
     /// Largest binding, in bytes.
@@ -25,12 +25,55 @@ pub struct Limits {
     pub max_buffers: u32,
     /// Most workgroups along one dimension of a dispatch.
     pub max_workgroups: u32,
+    /// Mixed precision: what matrix products read is stored in half precision, and sums stay in single. `None`: all is
+    /// single.
+    pub half: Option<Half>,
+}
+
+/// What a device has for half precision, beside storing it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Half {
+    pub matrices: Option<Matrices>,
+}
+
+/// Cooperative matrices of `side x side` that a subgroup multiplies: halves, summed in single precision.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Matrices {
+    pub side: u32,
+    /// Invocations of a subgroup.
+    pub subgroup: u32,
+}
+
+/// How a lane is stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Storage {
+    F32,
+    F16,
+    U32,
+}
+
+impl Storage {
+    pub fn bytes(self) -> u64 {
+        match self {
+            Storage::F32 | Storage::U32 => 4,
+            Storage::F16 => 2,
+        }
+    }
+}
+
+impl From<DType> for Storage {
+    fn from(t: DType) -> Storage {
+        match t {
+            DType::F32 => Storage::F32,
+            DType::U32 => Storage::U32,
+        }
+    }
 }
 
 impl Default for Limits {
     /// What WebGPU guarantees.
     fn default() -> Limits {
-        Limits { max_binding: 128 << 20, max_buffers: 8, max_workgroups: 65535 }
+        Limits { max_binding: 128 << 20, max_buffers: 8, max_workgroups: 65535, half: None }
     }
 }
 
@@ -38,8 +81,15 @@ impl Default for Limits {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Arena {
     pub name: String,
-    pub dtype: DType,
+    pub storage: Storage,
     pub lanes: u64,
+}
+
+impl Arena {
+    /// Of its buffer, which is never empty.
+    pub fn bytes(&self) -> u64 {
+        self.storage.bytes() * self.lanes.max(1)
+    }
 }
 
 /// Which arena.
@@ -56,7 +106,7 @@ pub enum ArenaId {
 pub struct Place {
     pub parts: Vec<Part>,
     pub stretch: u32,
-    pub dtype: DType,
+    pub storage: Storage,
 }
 
 /// Where a part of a buffer begins.
@@ -100,6 +150,8 @@ pub struct Layout<'a> {
     pub own: Vec<Arena>,
     buffers: Vec<(Place, Shape, String)>,
     max_lanes: u64,
+    /// Whether matrix products work in half precision.
+    half: bool,
     /// Scratch arenas of this launch: next free lane of each.
     scratch: Vec<(usize, u64)>,
 }
@@ -108,20 +160,25 @@ impl<'a> Layout<'a> {
     pub fn new(program: &Program, inputs: &'a mut Inputs, limits: &Limits) -> Result<Layout<'a>, LowerError> {
         // Whole stretches of aligned lanes, at least one.
         let max_lanes = ((limits.max_binding / 4).min(u32::MAX as u64) / ALIGN * ALIGN).max(ALIGN);
-        let mut layout = Layout { inputs, own: vec![], buffers: vec![], max_lanes, scratch: vec![] };
+        let mut layout =
+            Layout { inputs, own: vec![], buffers: vec![], max_lanes, half: limits.half.is_some(), scratch: vec![] };
         layout.inputs.sealed = layout.inputs.arenas.len();
-        let mut slots: Vec<Option<Place>> = vec![None; program.slots.len()];
-        for buffer in &program.buffers {
+        let multiplied = multiplied(program);
+        // A slot may hold floats for some launches and halves for others.
+        let mut slots: BTreeMap<(usize, bool), Place> = BTreeMap::new();
+        for (buffer, multiplied) in program.buffers.iter().zip(multiplied) {
             let lanes = buffer.shape.lanes() as u64;
-            let dtype = buffer.shape.dtype;
+            let half = layout.half && multiplied && may_be_half(&buffer.shape);
+            let storage = if half { Storage::F16 } else { buffer.shape.dtype.into() };
             fits(&buffer.label, lanes)?;
             let place = match &buffer.kind {
                 BufferKind::Input { name, role } => layout.input(name, *role, &buffer.shape)?,
-                BufferKind::Output => layout.allocate("work", dtype, lanes),
+                BufferKind::Output => layout.allocate("work", buffer.shape.dtype.into(), lanes),
                 // Integers lie among integers and share no slot: their bits must not pass through float registers.
-                BufferKind::Temporary { .. } if dtype == DType::U32 => layout.allocate("work", dtype, lanes),
-                BufferKind::Temporary { slot } => slots[*slot]
-                    .get_or_insert_with(|| layout.allocate("work", dtype, program.slots[*slot] as u64))
+                BufferKind::Temporary { .. } if storage == Storage::U32 => layout.allocate("work", storage, lanes),
+                BufferKind::Temporary { slot } => slots
+                    .entry((*slot, half))
+                    .or_insert_with(|| layout.allocate("work", storage, program.slots[*slot] as u64))
                     .clone(),
             };
             // `relu network.rs:12` is called `relu` in kernels.
@@ -144,18 +201,19 @@ impl<'a> Layout<'a> {
         // Per-step values lie together: the host writes them in one go.
         let class = if role == Role::PerStep { "per_step" } else { "inputs" };
         let (arenas, most) = (&mut self.inputs.arenas, self.max_lanes);
-        let place = in_parts(shape.dtype, shape.lanes() as u64, most, |lanes| {
-            let (at, offset) = grow(arenas, sealed, class, shape.dtype, lanes, most);
+        let storage = shape.dtype.into();
+        let place = in_parts(storage, shape.lanes() as u64, most, |lanes| {
+            let (at, offset) = grow(arenas, sealed, class, storage, lanes, most);
             Part { arena: ArenaId::Input(at), offset }
         });
         self.inputs.places.insert(name.into(), (place.clone(), shape.clone()));
         Ok(place)
     }
 
-    fn allocate(&mut self, class: &str, dtype: DType, lanes: u64) -> Place {
+    fn allocate(&mut self, class: &str, storage: Storage, lanes: u64) -> Place {
         let (arenas, most) = (&mut self.own, self.max_lanes);
-        in_parts(dtype, lanes, most, |lanes| {
-            let (at, offset) = grow(arenas, 0, class, dtype, lanes, most);
+        in_parts(storage, lanes, most, |lanes| {
+            let (at, offset) = grow(arenas, 0, class, storage, lanes, most);
             Part { arena: ArenaId::Own(at), offset }
         })
     }
@@ -167,21 +225,33 @@ impl<'a> Layout<'a> {
 
     /// A buffer that lives during this launch.
     pub fn scratch(&mut self, name: &str, shape: Shape) -> Result<BufferId, LowerError> {
+        let storage = shape.dtype.into();
+        self.scratch_stored(name, shape, storage)
+    }
+
+    /// The same for what a matrix product reads.
+    pub fn scratch_for_product(&mut self, name: &str, shape: Shape) -> Result<BufferId, LowerError> {
+        let half = self.half && may_be_half(&shape);
+        let storage = if half { Storage::F16 } else { shape.dtype.into() };
+        self.scratch_stored(name, shape, storage)
+    }
+
+    fn scratch_stored(&mut self, name: &str, shape: Shape, storage: Storage) -> Result<BufferId, LowerError> {
         let lanes = shape.lanes() as u64;
         fits("scratch memory", lanes)?;
-        let (dtype, most) = (shape.dtype, self.max_lanes);
-        let place = in_parts(dtype, lanes, most, |lanes| self.scratch_part(dtype, lanes));
+        let most = self.max_lanes;
+        let place = in_parts(storage, lanes, most, |lanes| self.scratch_part(storage, lanes));
         self.buffers.push((place, shape, name.into()));
         Ok(BufferId(self.buffers.len() as u32 - 1))
     }
 
-    fn scratch_part(&mut self, dtype: DType, lanes: u64) -> Part {
-        let room = |s: &(usize, u64)| self.own[s.0].dtype == dtype && s.1 + lanes <= self.max_lanes;
+    fn scratch_part(&mut self, storage: Storage, lanes: u64) -> Part {
+        let room = |s: &(usize, u64)| self.own[s.0].storage == storage && s.1 + lanes <= self.max_lanes;
         let at = match self.scratch.iter().position(room) {
             Some(at) => at,
             None => {
-                let name = arena_name(&self.own, "scratch", dtype);
-                self.own.push(Arena { name, dtype, lanes: 0 });
+                let name = arena_name(&self.own, "scratch", storage);
+                self.own.push(Arena { name, storage, lanes: 0 });
                 self.scratch.push((self.own.len() - 1, 0));
                 self.scratch.len() - 1
             }
@@ -232,8 +302,37 @@ fn fits(name: &str, lanes: u64) -> Result<(), LowerError> {
     }
 }
 
+/// Channels from which a value may be stored in half precision: features, not coordinates.
+const WIDE: usize = 16;
+
+fn may_be_half(shape: &Shape) -> bool {
+    shape.dtype == DType::F32 && shape.channels.count() >= WIDE
+}
+
+/// Which buffers of a program a matrix product reads: it rounds them in any case.
+fn multiplied(program: &Program) -> Vec<bool> {
+    let mut found = vec![false; program.buffers.len()];
+    for launch in &program.launches {
+        let region = &launch.region;
+        for id in region.ids().filter(|id| is_multiplied(region, *id)) {
+            if let RegionOp::Load(buffer) = region.inst(id).op {
+                found[buffer.0 as usize] = true;
+            }
+        }
+    }
+    found
+}
+
+/// Whether a value is an operand of a product that gets a kernel of its own: the input of a layer, or either side of an
+/// outer product.
+pub(super) fn is_multiplied(region: &Region, id: InstId) -> bool {
+    let by_layer = |i: &Inst| matches!(i.op, RegionOp::Linear(_)) && i.inputs[0] == id;
+    let by_outer = |s: &Store| matches!(s, Store::Outer { x, d, .. } if *x == id || *d == id);
+    region.body.iter().any(by_layer) || region.stores.iter().any(by_outer)
+}
+
 /// A place for so many lanes: `put` is given the lanes of one part after the other, multiples of [`ALIGN`] up to `most`.
-fn in_parts(dtype: DType, lanes: u64, most: u64, mut put: impl FnMut(u64) -> Part) -> Place {
+fn in_parts(storage: Storage, lanes: u64, most: u64, mut put: impl FnMut(u64) -> Part) -> Place {
     let mut parts = vec![];
     let mut left = lanes.next_multiple_of(ALIGN).max(ALIGN);
     while left > 0 {
@@ -241,15 +340,15 @@ fn in_parts(dtype: DType, lanes: u64, most: u64, mut put: impl FnMut(u64) -> Par
         parts.push(put(part));
         left -= part;
     }
-    Place { parts, stretch: most as u32, dtype }
+    Place { parts, stretch: most as u32, storage }
 }
 
 /// Puts lanes into the first arena of a class and type, from `first` on, that has room, or a new one.
-fn grow(arenas: &mut Vec<Arena>, first: usize, class: &str, dtype: DType, lanes: u64, most: u64) -> (usize, u32) {
-    let fits = |a: &Arena| a.dtype == dtype && a.name.starts_with(class) && a.lanes + lanes <= most;
+fn grow(arenas: &mut Vec<Arena>, first: usize, class: &str, storage: Storage, lanes: u64, most: u64) -> (usize, u32) {
+    let fits = |a: &Arena| a.storage == storage && a.name.starts_with(class) && a.lanes + lanes <= most;
     let at = (first..arenas.len()).find(|i| fits(&arenas[*i])).unwrap_or_else(|| {
-        let name = arena_name(arenas, class, dtype);
-        arenas.push(Arena { name, dtype, lanes: 0 });
+        let name = arena_name(arenas, class, storage);
+        arenas.push(Arena { name, storage, lanes: 0 });
         arenas.len() - 1
     });
     let offset = arenas[at].lanes;
@@ -257,10 +356,14 @@ fn grow(arenas: &mut Vec<Arena>, first: usize, class: &str, dtype: DType, lanes:
     (at, offset as u32)
 }
 
-/// `work`, `work_u32`, and with a letter or two from the second of a kind on.
-fn arena_name(arenas: &[Arena], class: &str, dtype: DType) -> String {
-    let stem = if dtype == DType::U32 { format!("{class}_u32") } else { class.to_string() };
-    let same = arenas.iter().filter(|a| a.dtype == dtype && a.name.starts_with(class)).count();
+/// `work`, `work_u32`, `work_f16`, and with a letter or two from the second of a kind on.
+fn arena_name(arenas: &[Arena], class: &str, storage: Storage) -> String {
+    let stem = match storage {
+        Storage::F32 => class.to_string(),
+        Storage::F16 => format!("{class}_f16"),
+        Storage::U32 => format!("{class}_u32"),
+    };
+    let same = arenas.iter().filter(|a| a.storage == storage && a.name.starts_with(class)).count();
     let letter = |n: usize| (b'a' + (n % 26) as u8) as char;
     match same {
         0 => stem,

@@ -1,9 +1,10 @@
 //! A kernel being built: naga statements, the arenas it binds, and positions in the domain.
 
 use super::builder::{Builder, Kind, Memory, Value};
-use super::layout::{Arena, ArenaId, Layout, Limits, Part, Place};
+use super::layout::{Arena, ArenaId, Half, Layout, Limits, Part, Place, Storage};
 use super::{Binding, Kernel, LowerError};
 use naga::BuiltIn;
+use naga::valid::Capabilities;
 use raygrad_compiler::graph::{Axes, Axis};
 use raygrad_compiler::plan::region::BufferId;
 use raygrad_compiler::scalar::DType;
@@ -21,6 +22,8 @@ pub(super) struct Emit<'l, 'a> {
     pub invocation: Value,
     groups: [u32; 3],
     limits: Limits,
+    /// Whether float arenas are bound as vectors of four lanes.
+    vectors: bool,
 }
 
 impl<'l, 'a> Emit<'l, 'a> {
@@ -42,7 +45,13 @@ impl<'l, 'a> Emit<'l, 'a> {
             workgroup = b.add(before, workgroup);
         }
         let groups = [columns as u32, rows.max(1) as u32, 1];
-        Ok(Emit { b, layout, bound: vec![], workgroup, invocation, groups, limits })
+        Ok(Emit { b, layout, bound: vec![], workgroup, invocation, groups, limits, vectors: false })
+    }
+
+    /// Binds float arenas as vectors of four lanes, for kernels that mostly access four neighbours at once.
+    pub fn with_vectors(mut self) -> Emit<'l, 'a> {
+        self.vectors = true;
+        self
     }
 
     /// Starts a kernel of `count` invocations; leaves the spare ones of the last workgroup. Returns its number, too.
@@ -75,8 +84,9 @@ impl<'l, 'a> Emit<'l, 'a> {
             }
             return known.1;
         }
-        let Arena { name, dtype, .. } = self.layout.arena(arena);
-        let memory = self.b.storage(name, (*dtype).into());
+        let Arena { name, storage, .. } = self.layout.arena(arena);
+        let vector = self.vectors && *storage != Storage::U32;
+        let memory = self.b.storage(name, (*storage).into(), vector);
         if write {
             self.b.make_writable(memory);
         }
@@ -90,7 +100,8 @@ impl<'l, 'a> Emit<'l, 'a> {
         if let [part] = place.parts[..] {
             return self.load_part(part, index);
         }
-        let nothing = self.b.literal(place.dtype.into(), 0);
+        let kind = if place.storage == Storage::U32 { Kind::U32 } else { Kind::F32 };
+        let nothing = self.b.literal(kind, 0);
         let found = self.b.var("found", nothing);
         self.in_part(place, index, &mut |e, part, index| {
             let value = e.load_part(part, index);
@@ -99,21 +110,61 @@ impl<'l, 'a> Emit<'l, 'a> {
         self.b.get(found)
     }
 
+    /// Four neighbouring lanes of a buffer of floats, from a multiple of four on, in a kernel `with_vectors`.
+    pub fn load_four(&mut self, buffer: BufferId, index: Value) -> Value {
+        let place = self.layout.place(buffer);
+        if let [part] = place.parts[..] {
+            return self.load_four_of(part, index);
+        }
+        let zero = self.b.f(0.0);
+        let zeros = self.b.splat(zero);
+        let found = self.b.var("found", zeros);
+        self.in_part(place, index, &mut |e, part, index| {
+            let value = e.load_four_of(part, index);
+            e.b.set(found, value);
+        });
+        self.b.get(found)
+    }
+
+    /// Sets four neighbouring lanes of a buffer of floats, as [`Emit::load_four`] reads them.
+    pub fn store_four(&mut self, buffer: BufferId, index: Value, value: Value) {
+        let place = self.layout.place(buffer);
+        let value = self.b.splat(value);
+        self.in_part(place, index, &mut |e, part, index| {
+            let memory = e.memory(part.arena, true);
+            let at = e.four(part, index);
+            e.b.store(memory, at, value);
+        });
+    }
+
     pub fn store(&mut self, buffer: BufferId, index: Value, value: Value) {
         let place = self.layout.place(buffer);
         self.in_part(place, index, &mut |e, part, index| {
             let memory = e.memory(part.arena, true);
             let offset = e.b.u(part.offset);
             let at = e.b.add(index, offset);
-            e.b.store(memory, at, value);
+            e.b.store_lane(memory, at, value);
         });
+    }
+
+    fn load_four_of(&mut self, part: Part, index: Value) -> Value {
+        let memory = self.memory(part.arena, false);
+        let at = self.four(part, index);
+        self.b.load(memory, at)
+    }
+
+    /// Number of the vector that begins with a lane of a part. Parts begin at multiples of four.
+    fn four(&mut self, part: Part, index: Value) -> Value {
+        let (offset, four) = (self.b.u(part.offset), self.b.u(4));
+        let at = self.b.add(index, offset);
+        self.b.div(at, four)
     }
 
     fn load_part(&mut self, part: Part, index: Value) -> Value {
         let memory = self.memory(part.arena, false);
         let offset = self.b.u(part.offset);
         let at = self.b.add(index, offset);
-        self.b.load(memory, at)
+        self.b.load_lane(memory, at)
     }
 
     /// Does something in the part that holds lane `index`, with the number that the lane has there.
@@ -153,7 +204,7 @@ impl<'l, 'a> Emit<'l, 'a> {
         let workgroup_size = self.b.workgroup_size;
         let module = self.b.finish();
         let mut validator =
-            naga::valid::Validator::new(naga::valid::ValidationFlags::all(), naga::valid::Capabilities::empty());
+            naga::valid::Validator::new(naga::valid::ValidationFlags::all(), capabilities(self.limits.half));
         let info = validator
             .validate(&module)
             .map_err(|e| LowerError::Invalid { kernel: name.clone(), message: e.emit_to_string("") })?;
@@ -164,6 +215,17 @@ impl<'l, 'a> Emit<'l, 'a> {
     /// Whether the dispatch has more workgroups than were asked for.
     pub fn spare_workgroups(&self) -> bool {
         self.groups[1] > 1
+    }
+}
+
+/// What modules may use.
+fn capabilities(half: Option<Half>) -> Capabilities {
+    match half {
+        None => Capabilities::empty(),
+        Some(Half { matrices: None }) => Capabilities::SHADER_FLOAT16,
+        Some(Half { matrices: Some(_) }) => {
+            Capabilities::SHADER_FLOAT16 | Capabilities::COOPERATIVE_MATRIX | Capabilities::SUBGROUP
+        }
     }
 }
 
@@ -229,6 +291,13 @@ impl Position {
         }
         sum
     }
+}
+
+/// Whether elements of a buffer with the given axes that neighbour in `rows` neighbour in memory, and a multiple of four of
+/// them begins at a multiple of four, if the number of rows is one.
+pub(super) fn is_run(axes: &Axes, rows: &Axes) -> bool {
+    let (all, rows): (Vec<&Axis>, Vec<&Axis>) = (axes.iter().collect(), rows.iter().collect());
+    !rows.is_empty() && all.ends_with(&rows)
 }
 
 /// Neighbouring axes out of those that `number` counts need one division and one remainder at most.

@@ -27,7 +27,7 @@ mod scatter;
 mod stages;
 mod tile;
 
-pub use layout::{Arena, ArenaId, Inputs, Limits, Part, Place};
+pub use layout::{Arena, ArenaId, Half, Inputs, Limits, Matrices, Part, Place, Storage};
 
 use layout::Layout;
 use raygrad_compiler::graph::Shape;

@@ -3,18 +3,20 @@
 
 use super::builder::Value;
 use super::layout::{Layout, Limits};
-use super::memory::{Emit, Position};
+use super::memory::{Emit, Position, is_run};
 use super::reduce::{End, finish};
-use super::tile::{Along, Tile, multiply};
+use super::tile::{Along, Operand, Tile, multiply, split};
 use super::{Kernel, LowerError};
 use naga::MathFunction as Math;
 use raygrad_compiler::graph::{Axes, Shape};
 use raygrad_compiler::ops::Reduction;
 use raygrad_compiler::plan::region::{BufferId, Region, RegionOp, Store};
 use raygrad_compiler::scalar::DType;
+use std::ops::Range;
 
-/// Workgroups that fill a device.
-const ENOUGH: usize = 512;
+/// Workgroups of tiles that fill a device, and of smaller ones.
+const ENOUGH: usize = 256;
+const ENOUGH_SMALL: usize = 512;
 /// Rows of a chunk, at least.
 const CHUNK_ROWS: usize = 256;
 /// Chunks, at most.
@@ -33,61 +35,99 @@ pub(super) fn kernels(
     };
     let keep = layout.shape(*buffer).axes.clone();
     let over = region.domain.minus(&keep);
-    let (inputs, outputs) = (region.inst(*x).channels, region.inst(*d).channels);
     let (rows, kept) = (over.elements(), keep.elements());
-    let tile = Tile::of(outputs, rows);
-    let tiles = inputs.div_ceil(tile.m as usize) * outputs.div_ceil(tile.n as usize) * kept;
-    let wanted = ENOUGH.div_ceil(tiles).min(rows.div_ceil(CHUNK_ROWS)).min(MAX_CHUNKS);
-    let per_chunk = rows.div_ceil(wanted).next_multiple_of(tile.k as usize);
-    let chunks = rows.div_ceil(per_chunk);
+    let side = |buffer: BufferId, channels: usize| Side { buffer, channels: 0..channels };
+    let (inputs, outputs) = (region.inst(*x).channels, region.inst(*d).channels);
+    // Four neighbouring m are one vector, and so should neighbouring outputs be; but narrow tiles are narrow along n.
+    let swapped = outputs > 32;
+    let (x, d) = (side(*x_buffer, inputs), side(*d_buffer, outputs));
+    let (m, n) = if swapped { (d, x) } else { (x, d) };
+    let mut parts: Vec<(Side, Side)> = vec![];
+    for channels in split(n.channels.len()) {
+        let n = Side { channels, ..n.clone() };
+        parts.extend(split(m.channels.len()).into_iter().map(|c| (Side { channels: c, ..m.clone() }, n.clone())));
+    }
     let lanes = inputs * outputs * kept;
+    let mut outers = vec![];
+    for (m, n) in parts {
+        // A narrow tile is narrow along n.
+        let ((m, n), swapped) = if m.channels.len() < 32 { ((n, m), !swapped) } else { ((m, n), swapped) };
+        let products = kept * rows.div_ceil(CHUNK_ROWS).min(MAX_CHUNKS);
+        let tile = Tile::of(&limits, (m.channels.len(), n.channels.len(), rows), products);
+        outers.push(Outer {
+            m,
+            n,
+            swapped,
+            tile,
+            inputs,
+            outputs,
+            rows,
+            to: *buffer,
+            per_chunk: rows,
+            keep: keep.clone(),
+            over: over.clone(),
+        });
+    }
+    // All parts have the same chunks, so that one kernel sums them.
+    let groups: usize = outers.iter().map(|o| o.tiles() * kept).max().unwrap_or(1);
+    let enough = if outers.iter().any(|o| o.tile.invocations() > 64) { ENOUGH } else { ENOUGH_SMALL };
+    let wanted = enough.div_ceil(groups).min(rows.div_ceil(CHUNK_ROWS)).min(MAX_CHUNKS);
+    let depth = outers.iter().map(|o| o.tile.k).max().unwrap_or(1) as usize;
+    let per_chunk = rows.div_ceil(wanted).next_multiple_of(depth);
+    let chunks = rows.div_ceil(per_chunk);
     let partials = match chunks {
         1 => *buffer,
         _ => layout.scratch("partial", Shape::of(Axes::none(), chunks * lanes, DType::F32))?,
     };
-    let outer = Outer {
-        x: *x_buffer,
-        d: *d_buffer,
-        to: partials,
-        tile,
-        inputs: inputs as u32,
-        outputs: outputs as u32,
-        rows: rows as u32,
-        per_chunk: per_chunk as u32,
-        chunks: chunks as u32,
-        keep,
-        over,
-    };
-    let first = outer.kernel(layout, limits, name)?;
-    if chunks == 1 {
-        return Ok(vec![first]);
+    let several = outers.len() > 1;
+    let mut all = vec![];
+    for (i, outer) in outers.iter_mut().enumerate() {
+        (outer.per_chunk, outer.to) = (per_chunk, partials);
+        let name = if several { format!("{name}.{}", i + 1) } else { name.to_string() };
+        all.push(outer.kernel(layout, limits, &name)?);
     }
-    let end = End { buffer: *buffer, first: 0, lanes, kind: Reduction::Sum };
-    let last = finish(layout, limits, &format!("{name}.finish"), partials, chunks, &[end])?;
-    Ok(vec![first, last])
+    if chunks > 1 {
+        let end = End { buffer: *buffer, first: 0, lanes, kind: Reduction::Sum };
+        all.push(finish(layout, limits, &format!("{name}.finish"), partials, chunks, &[end])?);
+    }
+    Ok(all)
+}
+
+/// Channels of a factor of the outer product.
+#[derive(Clone)]
+struct Side {
+    buffer: BufferId,
+    channels: Range<usize>,
 }
 
 struct Outer {
-    x: BufferId,
-    d: BufferId,
-    to: BufferId,
+    m: Side,
+    n: Side,
+    /// Whether m counts outputs, and n inputs.
+    swapped: bool,
     tile: Tile,
-    inputs: u32,
-    outputs: u32,
-    rows: u32,
-    per_chunk: u32,
-    chunks: u32,
+    inputs: usize,
+    outputs: usize,
+    rows: usize,
+    to: BufferId,
+    per_chunk: usize,
     keep: Axes,
     over: Axes,
 }
 
 impl Outer {
+    fn tiles(&self) -> usize {
+        self.m.channels.len().div_ceil(self.tile.m as usize) * self.n.channels.len().div_ceil(self.tile.n as usize)
+    }
+
     fn kernel(&self, layout: &Layout, limits: Limits, name: &str) -> Result<Kernel, LowerError> {
         let tile = self.tile;
         let kept = self.keep.elements() as u32;
-        let (tiles_m, tiles_n) = (self.inputs.div_ceil(tile.m), self.outputs.div_ceil(tile.n));
-        let groups = self.chunks as u64 * kept as u64 * tiles_m as u64 * tiles_n as u64;
-        let mut e = Emit::new(layout, limits, groups, tile.invocations())?;
+        let tiles_m = (self.m.channels.len() as u32).div_ceil(tile.m);
+        let tiles_n = (self.n.channels.len() as u32).div_ceil(tile.n);
+        let chunks = self.rows.div_ceil(self.per_chunk) as u32;
+        let groups = chunks as u64 * kept as u64 * tiles_m as u64 * tiles_n as u64;
+        let mut e = Emit::new(layout, limits, groups, tile.invocations())?.with_vectors();
         if e.spare_workgroups() {
             e.leave_from(e.workgroup, groups as u32);
         }
@@ -99,87 +139,106 @@ impl Outer {
             own
         };
         let (tile_m, tile_n) = (next(&mut e, tiles_m), next(&mut e, tiles_n));
-        let (keep, chunk) = (next(&mut e, kept), next(&mut e, self.chunks));
-        let (m, n) = (e.b.u(tile.m), e.b.u(tile.n));
-        let (first_input, first_output) = (e.b.mul(tile_m, m), e.b.mul(tile_n, n));
-        e.b.name(first_input, "first_input");
-        e.b.name(first_output, "first_output");
-        let (length, rows) = (e.b.u(self.per_chunk), e.b.u(self.rows));
+        let (keep, chunk) = (next(&mut e, kept), next(&mut e, chunks));
+        let first = |e: &mut Emit, side: &Side, number: Value, size: u32| {
+            let (size, before) = (e.b.u(size), e.b.u(side.channels.start as u32));
+            let first = e.b.mul(number, size);
+            e.b.add(first, before)
+        };
+        let (first_m, first_n) = (first(&mut e, &self.m, tile_m, tile.m), first(&mut e, &self.n, tile_n, tile.n));
+        e.b.name(first_m, "first_m");
+        e.b.name(first_n, "first_n");
+        let (length, rows) = (e.b.u(self.per_chunk as u32), e.b.u(self.rows as u32));
         let from = e.b.mul(chunk, length);
         let end = e.b.add(from, length);
         let to = e.b.math(Math::Min, &[end, rows]);
-        let block = multiply(
+        let lanes = e.b.u((self.inputs * self.outputs) as u32 * kept);
+        let chunk_first = e.b.mul(chunk, lanes);
+        multiply(
             &mut e,
             tile,
             (from, to),
-            (&mut |e, k, at| self.vector(e, (self.x, self.inputs, tile.m), keep, first_input, k, at, true), Along::K),
-            (
-                &mut |e, k, at| self.vector(e, (self.d, self.outputs, tile.n), keep, first_output, k, at, false),
-                Along::K,
-            ),
+            Operand {
+                along: Along::K,
+                load: &mut |e, k, at| self.rows(e, (&self.m, tile.m), keep, first_m, k, at, true),
+            },
+            Operand {
+                along: Along::K,
+                load: &mut |e, k, at| self.rows(e, (&self.n, tile.n), keep, first_n, k, at, false),
+            },
+            &mut |e, at, sums| {
+                let m = e.b.add(first_m, at);
+                for (at, sum) in sums {
+                    let n = e.b.add(first_n, *at);
+                    let guarded = !self.n.channels.len().is_multiple_of(tile.n as usize);
+                    if guarded {
+                        let end = e.b.u(self.n.channels.end as u32);
+                        let inside = e.b.less(n, end);
+                        e.b.open_if(inside);
+                    }
+                    self.write(e, m, n, *sum, keep, chunk_first);
+                    if guarded {
+                        e.b.close_if();
+                    }
+                }
+            },
         );
-        let lanes = e.b.u(self.inputs * self.outputs * kept);
-        let block_first = e.b.mul(chunk, lanes);
-        for i in 0..tile.own_m / 4 {
-            let at = block.m(&mut e, i);
-            let input = e.b.add(first_input, at);
-            for j in 0..tile.own_n {
-                let at = block.n(&mut e, j);
-                let output = e.b.add(first_output, at);
-                let sum = block.sum(&mut e, i, j);
-                let outputs = e.b.u(self.outputs);
-                let guarded = !self.outputs.is_multiple_of(tile.n);
-                if guarded {
-                    let inside = e.b.less(output, outputs);
-                    e.b.open_if(inside);
-                }
-                for lane in 0..4 {
-                    self.write(&mut e, (input, lane), output, sum, keep, block_first);
-                }
-                if guarded {
-                    e.b.close_if();
-                }
-            }
-        }
         e.finish(name)
     }
 
-    fn write(
-        &self,
-        e: &mut Emit,
-        (first, lane): (Value, u32),
-        output: Value,
-        sum: Value,
-        keep: Value,
-        block_first: Value,
-    ) {
-        let offset = e.b.u(lane);
-        let input = e.b.add(first, offset);
-        let guarded = !self.inputs.is_multiple_of(self.tile.m);
-        if guarded {
-            let inputs = e.b.u(self.inputs);
-            let inside = e.b.less(input, inputs);
-            e.b.open_if(inside);
-        }
-        let (outputs, kept) = (e.b.u(self.outputs), e.b.u(self.keep.elements() as u32));
+    /// Lane of the product of input and output channels in a chunk's block.
+    fn lane(&self, e: &mut Emit, m: Value, n: Value, keep: Value, chunk_first: Value) -> Value {
+        let (input, output) = if self.swapped { (n, m) } else { (m, n) };
+        let (outputs, kept) = (e.b.u(self.outputs as u32), e.b.u(self.keep.elements() as u32));
         let channel = e.b.mul(input, outputs);
         let channel = e.b.add(channel, output);
         let at = e.b.mul(channel, kept);
         let at = e.b.add(at, keep);
-        let at = e.b.add(at, block_first);
-        let value = e.b.component(sum, lane);
-        e.store(self.to, at, value);
-        if guarded {
-            e.b.close_if();
+        e.b.add(at, chunk_first)
+    }
+
+    /// Writes four neighbouring m of one n.
+    fn write(&self, e: &mut Emit, m: Value, n: Value, sum: Value, keep: Value, chunk_first: Value) {
+        let Range { start, end } = self.m.channels.clone();
+        let guarded = !(end - start).is_multiple_of(self.tile.m as usize);
+        let fours = [start, end, self.outputs].iter().all(|x| x.is_multiple_of(4));
+        if self.swapped && self.keep.elements() == 1 && fours {
+            if guarded {
+                let end = e.b.u(end as u32);
+                let inside = e.b.less(m, end);
+                e.b.open_if(inside);
+            }
+            let at = self.lane(e, m, n, keep, chunk_first);
+            e.store_four(self.to, at, sum);
+            if guarded {
+                e.b.close_if();
+            }
+            return;
+        }
+        for lane in 0..4 {
+            let offset = e.b.u(lane);
+            let m = e.b.add(m, offset);
+            if guarded {
+                let end = e.b.u(end as u32);
+                let inside = e.b.less(m, end);
+                e.b.open_if(inside);
+            }
+            let at = self.lane(e, m, n, keep, chunk_first);
+            let value = e.b.component(sum, lane);
+            e.store(self.to, at, value);
+            if guarded {
+                e.b.close_if();
+            }
         }
     }
 
-    /// Four neighbouring channels of a row, those past the end clamped to the last; zeros past the last row if asked for.
+    /// A channel of four neighbouring rows; channels past the end are clamped to the last, rows past the end too, or zeros
+    /// if asked for.
     #[expect(clippy::too_many_arguments, reason = "what the two operands of the product differ in")]
-    fn vector(
+    fn rows(
         &self,
         e: &mut Emit,
-        (buffer, channels, edge): (BufferId, u32, u32),
+        (side, edge): (&Side, u32),
         keep: Value,
         first: Value,
         row: Value,
@@ -187,32 +246,44 @@ impl Outer {
         zeros: bool,
     ) -> Value {
         e.b.topic("row");
-        let (count, last) = (e.b.u(self.rows), e.b.u(self.rows - 1));
-        let whole = self.rows.is_multiple_of(self.tile.k);
-        let own = if whole { row } else { e.b.math(Math::Min, &[row, last]) };
-        let position = match self.keep.is_empty() {
-            true => Position::new(&self.over, own),
-            false => Position::new(&self.keep, keep).and(&self.over, own),
+        let whole = self.rows.is_multiple_of(self.tile.k as usize);
+        let mut channel = e.b.add(first, at);
+        if !side.channels.len().is_multiple_of(edge as usize) {
+            let last = e.b.u(side.channels.end as u32 - 1);
+            channel = e.b.math(Math::Min, &[channel, last]);
+        }
+        let axes = e.layout.shape(side.buffer).axes.clone();
+        let index = |e: &mut Emit, row: Value| {
+            let position = match self.keep.is_empty() {
+                true => Position::new(&self.over, row),
+                false => Position::new(&self.keep, keep).and(&self.over, row),
+            };
+            let element = position.element(e, &axes);
+            e.index(side.buffer, channel, element)
         };
-        let axes = e.layout.shape(buffer).axes.clone();
-        let element = position.element(e, &axes);
-        let first = e.b.add(first, at);
+        let all = e.b.u(self.rows as u32);
+        if self.rows.is_multiple_of(4) && is_run(&axes, &self.over) {
+            let last = e.b.u(self.rows as u32 - 4);
+            let own = if whole { row } else { e.b.math(Math::Min, &[row, last]) };
+            let at = index(e, own);
+            let vector = e.load_four(side.buffer, at);
+            if whole || !zeros {
+                return vector;
+            }
+            let (inside, zero) = (e.b.less(row, all), e.b.f(0.0));
+            return e.b.select(inside, vector, zero);
+        }
         let mut lanes = vec![];
         for i in 0..4 {
-            let offset = e.b.u(i);
-            let mut channel = e.b.add(first, offset);
-            if !channels.is_multiple_of(edge) {
-                let last = e.b.u(channels - 1);
-                channel = e.b.math(Math::Min, &[channel, last]);
-            }
-            let at = e.index(buffer, channel, element);
-            lanes.push(e.load(buffer, at));
+            let (offset, last) = (e.b.u(i), e.b.u(self.rows as u32 - 1));
+            let row = e.b.add(row, offset);
+            let own = if whole { row } else { e.b.math(Math::Min, &[row, last]) };
+            let at = index(e, own);
+            let value = e.load(side.buffer, at);
+            let inside = e.b.less(row, all);
+            let zero = e.b.f(0.0);
+            lanes.push(if whole || !zeros { value } else { e.b.select(inside, value, zero) });
         }
-        let vector = e.b.vector([lanes[0], lanes[1], lanes[2], lanes[3]]);
-        if whole || !zeros {
-            return vector;
-        }
-        let (inside, zero) = (e.b.less(row, count), e.b.f(0.0));
-        e.b.select(inside, vector, zero)
+        e.b.vector([lanes[0], lanes[1], lanes[2], lanes[3]])
     }
 }

@@ -7,7 +7,7 @@
 //! One file above 400 lines: the parts are cut by one pass that holds their common state.
 
 use super::elements::{self, closure};
-use super::layout::{Layout, Limits};
+use super::layout::{Layout, Limits, is_multiplied};
 use super::{Kernel, LowerError, layer, outer, reduce, scan, scatter, stages};
 use raygrad_compiler::graph::{Axes, Shape};
 use raygrad_compiler::ops::Reduction;
@@ -62,7 +62,7 @@ pub(super) fn lower(layout: &mut Layout, limits: Limits, launch: &Launch) -> Res
                     kernels.extend(elements::kernels(layout, limits, &name, stage)?);
                 }
             }
-            Part::Layer(r, linear) => kernels.push(layer::kernel(layout, limits, &name, &r, linear)?),
+            Part::Layer(r, linear) => kernels.extend(layer::kernels(layout, limits, &name, &r, linear)?),
             Part::Scan(r) => {
                 let (before, scan) = stages::before_scan(layout, r)?;
                 if let Some(before) = before {
@@ -120,8 +120,9 @@ impl Split<'_, '_> {
         let mut late_region = empty(&self.region);
         for store in reloaded {
             let mut values = vec![];
+            let product = matches!(store, Store::Outer { .. });
             for value in store.values() {
-                let buffer = self.materialize(value)?;
+                let buffer = self.materialize(value, product)?;
                 values.push((value, self.push_load(&mut late_region, buffer)));
             }
             let find = |v: InstId| values.iter().find(|x| x.0 == v).map_or(v, |x| x.1);
@@ -224,14 +225,15 @@ impl Split<'_, '_> {
         }
         let inst = self.region.inst(value);
         let shape = Shape::of(self.region.domain.clone(), inst.channels, inst.dtype);
-        let buffer = self.layout.scratch(&inst.label.clone(), shape)?;
+        let buffer = self.layout.scratch_for_product(&inst.label.clone(), shape)?;
         let stores = vec![Store::Write { value, buffer }];
         self.sums.push(Part::Elements(Region { stores, ..self.region.clone() }.swept()));
         Ok(self.push_load(into, buffer))
     }
 
-    /// The buffer that a value is written to: one of the region's own, or scratch memory.
-    fn materialize(&mut self, value: InstId) -> Result<BufferId, LowerError> {
+    /// The buffer that a value is written to: one of the region's own, or scratch memory. `product`: a matrix product
+    /// reads it.
+    fn materialize(&mut self, value: InstId, product: bool) -> Result<BufferId, LowerError> {
         if let RegionOp::Load(buffer) = self.region.inst(value).op {
             return Ok(buffer);
         }
@@ -242,7 +244,11 @@ impl Split<'_, '_> {
         }
         let inst = self.region.inst(value);
         let shape = Shape::of(self.region.domain.clone(), inst.channels, inst.dtype);
-        let buffer = self.layout.scratch(&inst.label.clone(), shape)?;
+        let name = inst.label.clone();
+        let buffer = match product {
+            true => self.layout.scratch_for_product(&name, shape)?,
+            false => self.layout.scratch(&name, shape)?,
+        };
         self.region.stores.push(Store::Write { value, buffer });
         Ok(buffer)
     }
@@ -265,7 +271,8 @@ impl Split<'_, '_> {
         let mut cut: Vec<(InstId, BufferId)> = vec![];
         for id in self.region.ids() {
             if homes.cut.get(id.0 as usize).is_some_and(|c| *c) {
-                cut.push((id, self.materialize(id)?));
+                let product = is_multiplied(&self.region, id);
+                cut.push((id, self.materialize(id, product)?));
             }
         }
         let stores = std::mem::take(&mut self.region.stores);

@@ -3,6 +3,7 @@
 //! Everything is made when a program is loaded: arenas, pipelines, bindings. A step only submits.
 
 pub(crate) mod cache;
+pub(crate) mod half;
 
 use crate::session::Executor;
 use crate::{DeviceError, RunError};
@@ -10,7 +11,7 @@ use raygrad_compiler::Program;
 use raygrad_compiler::fuse::TargetKind;
 use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::plan::region::BufferId;
-use raygrad_kernels::gpu::{Arena, ArenaId, GpuLaunch, Inputs, Limits, LowerError, Part, Place, lower};
+use raygrad_kernels::gpu::{Arena, ArenaId, GpuLaunch, Half, Inputs, Limits, LowerError, Part, Place, lower};
 use std::collections::BTreeMap;
 use std::fmt;
 use std::ops::Range;
@@ -51,11 +52,6 @@ pub(crate) trait Api: Send {
 /// An error of a device, for people.
 pub(crate) fn device_error(name: &str, problem: impl Into<String>) -> RunError {
     RunError::Device { device: name.into(), problem: problem.into() }
-}
-
-/// Size of an arena's buffer in bytes.
-pub(crate) fn bytes(arena: &Arena) -> u64 {
-    4 * arena.lanes.max(1)
 }
 
 /// What an adapter is; the best kind first.
@@ -122,6 +118,7 @@ struct OnDevice<A: Api> {
 pub(crate) struct GpuExecutor<A: Api> {
     // First, so that a dropped session waits for its work before the buffers go.
     api: A,
+    half: Option<Half>,
     inputs: Inputs,
     /// Device buffers of the input arenas.
     arenas: Vec<A::Buffer>,
@@ -131,8 +128,8 @@ pub(crate) struct GpuExecutor<A: Api> {
 }
 
 impl<A: Api> GpuExecutor<A> {
-    pub fn new(api: A) -> GpuExecutor<A> {
-        GpuExecutor { api, inputs: Inputs::default(), arenas: vec![], mirrors: BTreeMap::new(), programs: vec![] }
+    pub fn new(api: A, half: Option<Half>) -> GpuExecutor<A> {
+        GpuExecutor { api, half, inputs: Inputs::default(), arenas: vec![], mirrors: BTreeMap::new(), programs: vec![] }
     }
 
     fn lower_error(&self, e: LowerError) -> RunError {
@@ -166,7 +163,7 @@ impl<A: Api> Executor for GpuExecutor<A> {
         if program.target.kind != TargetKind::Gpu {
             return Err(RunError::Target(program.target.kind));
         }
-        let lowered = lower(&program, &mut self.inputs, &self.api.limits()).map_err(|e| self.lower_error(e))?;
+        let lowered = lower(&program, &mut self.inputs, &Limits { half: self.half, ..self.api.limits() }).map_err(|e| self.lower_error(e))?;
         for arena in &self.inputs.arenas[self.arenas.len()..] {
             self.arenas.push(self.api.buffer(arena)?);
         }

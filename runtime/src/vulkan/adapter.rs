@@ -7,7 +7,7 @@ use crate::{DeviceError, RunError};
 use ash::{khr, vk};
 use gpu_allocator::AllocationSizes;
 use gpu_allocator::vulkan::{Allocator, AllocatorCreateDesc};
-use raygrad_kernels::gpu::Limits;
+use raygrad_kernels::gpu::{Half, Limits, Matrices};
 use std::ffi::CStr;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
@@ -27,6 +27,7 @@ pub struct Gpu {
     allocator: Mutex<Option<Allocator>>,
     adapter: Adapter,
     limits: Limits,
+    half: Option<Half>,
     clock: Option<Clock>,
     instance: Instance,
 }
@@ -74,13 +75,25 @@ impl Gpu {
             // A driver on top of another API wants to hear that we know.
             let known = raw.enumerate_device_extension_properties(physical).map_err(vulkan)?;
             let portability = khr::portability_subset::NAME;
-            let extensions: Vec<_> = known
-                .iter()
-                .filter(|e| e.extension_name_as_c_str() == Ok(portability))
-                .map(|_| portability.as_ptr())
-                .collect();
-            let description =
-                vk::DeviceCreateInfo::default().queue_create_infos(&queues).enabled_extension_names(&extensions);
+            let knows = |name: &CStr| known.iter().any(|e| e.extension_name_as_c_str() == Ok(name));
+            let mut extensions: Vec<_> = knows(portability).then_some(portability.as_ptr()).into_iter().collect();
+            let half = half(&instance, physical, &knows);
+            let mut stored = vk::PhysicalDevice16BitStorageFeatures::default().storage_buffer16_bit_access(true);
+            let mut computed = vk::PhysicalDeviceShaderFloat16Int8Features::default().shader_float16(true);
+            let mut multiplied = vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default().cooperative_matrix(true);
+            let mut model = vk::PhysicalDeviceVulkanMemoryModelFeatures::default()
+                .vulkan_memory_model(true)
+                .vulkan_memory_model_device_scope(true);
+            let mut description = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
+            if let Some(half) = half {
+                extensions.push(khr::shader_float16_int8::NAME.as_ptr());
+                description = description.push_next(&mut stored).push_next(&mut computed);
+                if half.matrices.is_some() {
+                    extensions.extend([khr::cooperative_matrix::NAME, khr::vulkan_memory_model::NAME].map(CStr::as_ptr));
+                    description = description.push_next(&mut multiplied).push_next(&mut model);
+                }
+            }
+            let description = description.enabled_extension_names(&extensions);
             let device = raw.create_device(physical, &description, None).map_err(vulkan)?;
             let queue = device.get_device_queue(family, 0);
             let bits = families[family as usize].timestamp_valid_bits;
@@ -92,6 +105,7 @@ impl Gpu {
                 max_binding: most.max_memory_allocation_size.min(properties.limits.max_storage_buffer_range as u64),
                 max_buffers: properties.limits.max_per_stage_descriptor_storage_buffers,
                 max_workgroups: properties.limits.max_compute_work_group_count[0],
+                half: None,
             };
             let clock = (bits > 0).then(|| Clock {
                 seconds_per_tick: 1e-9 * f64::from(properties.limits.timestamp_period),
@@ -125,6 +139,7 @@ impl Gpu {
                 family,
                 adapter,
                 limits,
+                half,
                 clock,
                 instance,
             })
@@ -144,6 +159,11 @@ impl Gpu {
 
     pub(super) fn limits(&self) -> Limits {
         self.limits
+    }
+
+    /// What it has for half precision, if it stores halves.
+    pub(crate) fn half(&self) -> Option<Half> {
+        self.half
     }
 
     pub(super) fn clock(&self) -> Option<Clock> {
@@ -204,6 +224,54 @@ fn describe_result(e: vk::Result) -> String {
         vk::Result::ERROR_OUT_OF_HOST_MEMORY => "out of memory".into(),
         other => other.to_string(),
     }
+}
+
+/// What a device has for half precision.
+fn half(instance: &Instance, physical: vk::PhysicalDevice, knows: &dyn Fn(&CStr) -> bool) -> Option<Half> {
+    if !knows(khr::shader_float16_int8::NAME) {
+        return None;
+    }
+    let mut stored = vk::PhysicalDevice16BitStorageFeatures::default();
+    let mut computed = vk::PhysicalDeviceShaderFloat16Int8Features::default();
+    let mut multiplied = vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default();
+    let mut model = vk::PhysicalDeviceVulkanMemoryModelFeatures::default();
+    let mut features = vk::PhysicalDeviceFeatures2::default().push_next(&mut stored).push_next(&mut computed);
+    let may_multiply = knows(khr::cooperative_matrix::NAME) && knows(khr::vulkan_memory_model::NAME);
+    if may_multiply {
+        features = features.push_next(&mut multiplied).push_next(&mut model);
+    }
+    let mut groups = vk::PhysicalDeviceSubgroupProperties::default();
+    let mut properties = vk::PhysicalDeviceProperties2::default().push_next(&mut groups);
+    // SAFETY: a physical device of this instance; the extensions of the structures are known to it.
+    unsafe {
+        instance.raw.get_physical_device_features2(physical, &mut features);
+        instance.raw.get_physical_device_properties2(physical, &mut properties);
+    }
+    if stored.storage_buffer16_bit_access != vk::TRUE || computed.shader_float16 != vk::TRUE {
+        return None;
+    }
+    let has_matrices = may_multiply
+        && multiplied.cooperative_matrix == vk::TRUE
+        && model.vulkan_memory_model == vk::TRUE
+        && model.vulkan_memory_model_device_scope == vk::TRUE;
+    let side = if has_matrices { matrix_side(instance, physical) } else { None };
+    Some(Half { matrices: side.map(|side| Matrices { side, subgroup: groups.subgroup_size }) })
+}
+
+/// Side of square matrices of halves that a subgroup multiplies, summed in single precision.
+fn matrix_side(instance: &Instance, physical: vk::PhysicalDevice) -> Option<u32> {
+    let extension = khr::cooperative_matrix::Instance::new(&instance.entry, &instance.raw);
+    // SAFETY: a physical device of this instance that knows the extension.
+    let all = unsafe { extension.get_physical_device_cooperative_matrix_properties(physical) }.unwrap_or_default();
+    let (f16, f32) = (vk::ComponentTypeKHR::FLOAT16, vk::ComponentTypeKHR::FLOAT32);
+    let fits = |p: &&vk::CooperativeMatrixPropertiesKHR| {
+        (p.a_type, p.b_type, p.c_type, p.result_type) == (f16, f16, f32, f32)
+            && p.scope == vk::ScopeKHR::SUBGROUP
+            && p.m_size == p.n_size
+            && p.m_size == p.k_size
+            && [8, 16].contains(&p.m_size)
+    };
+    all.iter().filter(fits).map(|p| p.m_size).max()
 }
 
 /// Those that know Vulkan 1.1, which brought SPIR-V 1.3.

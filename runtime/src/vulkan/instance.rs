@@ -24,7 +24,7 @@ pub(super) struct Instance {
     /// What the messenger writes to.
     pub complaints: Box<Complaints>,
     /// The loader's library stays open while the instance lives.
-    _entry: ash::Entry,
+    pub entry: ash::Entry,
 }
 
 impl Instance {
@@ -68,9 +68,9 @@ impl Instance {
                 .enabled_layer_names(&layers)
                 .enabled_extension_names(&extensions);
             let raw = entry.create_instance(&description, None).map_err(|e| unavailable(&e))?;
-            let mut instance = Instance { raw, validation: None, complaints: Box::default(), _entry: entry };
+            let mut instance = Instance { raw, validation: None, complaints: Box::default(), entry };
             if validate {
-                let utils = ext::debug_utils::Instance::new(&instance._entry, &instance.raw);
+                let utils = ext::debug_utils::Instance::new(&instance.entry, &instance.raw);
                 let severity =
                     vk::DebugUtilsMessageSeverityFlagsEXT::WARNING | vk::DebugUtilsMessageSeverityFlagsEXT::ERROR;
                 let kinds =

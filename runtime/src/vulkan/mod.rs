@@ -45,7 +45,7 @@ impl Api for VulkanApi {
     }
 
     fn buffer(&mut self, arena: &Arena) -> Result<Buffer, RunError> {
-        let buffer = Buffer::on_device(&self.gpu, &arena.name, crate::gpu::bytes(arena))?;
+        let buffer = Buffer::on_device(&self.gpu, &arena.name, arena.bytes())?;
         self.queue.zero(&buffer)?;
         Ok(buffer)
     }

@@ -2,9 +2,9 @@
 
 use super::api;
 use crate::gpu::cache::CacheFile;
-use crate::gpu::{Adapter, AdapterKind, bytes, choose, device_error};
+use crate::gpu::{Adapter, AdapterKind, choose, device_error};
 use crate::{DeviceError, RunError};
-use raygrad_kernels::gpu::{Arena, Limits};
+use raygrad_kernels::gpu::{Arena, Half, Limits, Matrices};
 use std::future::Future;
 use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -16,6 +16,7 @@ pub struct Gpu {
     pub(super) queue: api::Queue,
     adapter: Adapter,
     limits: Limits,
+    half: Option<Half>,
     /// Compiled pipelines, where the API lets them out.
     cache: Option<(CacheFile, api::PipelineCache)>,
     /// The first error nobody was asked about: wgpu reports most of them late.
@@ -44,10 +45,20 @@ impl Gpu {
     fn on(adapter: &api::Adapter) -> Result<Gpu, DeviceError> {
         let info = describe(adapter);
         let limits = adapter.limits();
+        let half = half(adapter);
+        let mut features = api::Features::TIMESTAMP_QUERY | api::Features::PIPELINE_CACHE | api::Features::SHADER_F16;
+        let mut experimental = api::ExperimentalFeatures::disabled();
+        if half.is_some_and(|h| h.matrices.is_some()) {
+            features |= api::Features::SUBGROUP | api::Features::EXPERIMENTAL_COOPERATIVE_MATRIX;
+            // SAFETY: of what is experimental, kernels use cooperative matrices alone, where the adapter has them, and a
+            // device is asked to use them only after it has passed a test.
+            experimental = unsafe { api::ExperimentalFeatures::enabled() };
+        }
         let descriptor = api::DeviceDescriptor {
             label: Some("raygrad"),
-            required_features: adapter.features() & (api::Features::TIMESTAMP_QUERY | api::Features::PIPELINE_CACHE),
+            required_features: adapter.features() & features,
             required_limits: limits.clone(),
+            experimental_features: experimental,
             memory_hints: api::MemoryHints::Performance,
             ..Default::default()
         };
@@ -72,6 +83,7 @@ impl Gpu {
             max_binding: limits.max_storage_buffer_binding_size.min(limits.max_buffer_size),
             max_buffers: limits.max_storage_buffers_per_shader_stage,
             max_workgroups: limits.max_compute_workgroups_per_dimension,
+            half: None,
         };
         let key = api::util::pipeline_cache_key(&adapter.get_info());
         let cache = key.filter(|_| device.features().contains(api::Features::PIPELINE_CACHE)).map(|key| {
@@ -84,7 +96,7 @@ impl Gpu {
             // SAFETY: the data came out of such a cache (a hash says so), and wgpu refuses those of another driver.
             (file, unsafe { device.create_pipeline_cache(&description) })
         });
-        Ok(Gpu { device, queue, adapter: info, limits, cache, failed })
+        Ok(Gpu { device, queue, adapter: info, limits, half, cache, failed })
     }
 
     /// The same device as if a kernel could bind no more than so many bytes of a buffer at once: larger buffers then lie in
@@ -111,6 +123,11 @@ impl Gpu {
         self.limits
     }
 
+    /// What it has for half precision, if it stores halves.
+    pub(crate) fn half(&self) -> Option<Half> {
+        self.half
+    }
+
     pub(super) fn problem(&self, problem: String) -> RunError {
         device_error(&self.adapter.name, problem)
     }
@@ -134,13 +151,13 @@ impl Gpu {
     pub(super) fn buffer(&self, arena: &Arena) -> Result<api::Buffer, RunError> {
         let buffer = self.device.create_buffer(&api::BufferDescriptor {
             label: Some(&arena.name),
-            size: bytes(arena),
+            size: arena.bytes(),
             usage: api::BufferUsages::STORAGE | api::BufferUsages::COPY_SRC | api::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         });
         self.check().map_err(|e| match e {
             RunError::Device { problem, .. } => {
-                self.problem(format!("`{}`, {} bytes: {problem}", arena.name, bytes(arena)))
+                self.problem(format!("`{}`, {} bytes: {problem}", arena.name, arena.bytes()))
             }
             other => other,
         })?;
@@ -156,6 +173,25 @@ impl Drop for Gpu {
             file.save(&pipelines);
         }
     }
+}
+
+/// What an adapter has for half precision.
+fn half(adapter: &api::Adapter) -> Option<Half> {
+    let (features, info) = (adapter.features(), adapter.get_info());
+    if !features.contains(api::Features::SHADER_F16) {
+        return None;
+    }
+    let needed = api::Features::SUBGROUP | api::Features::EXPERIMENTAL_COOPERATIVE_MATRIX;
+    let (f16, f32) = (api::CooperativeScalarType::F16, api::CooperativeScalarType::F32);
+    let side = adapter
+        .cooperative_matrix_properties()
+        .iter()
+        .filter(|p| (p.ab_type, p.cr_type) == (f16, f32) && p.m_size == p.n_size && p.m_size == p.k_size)
+        .map(|p| p.m_size)
+        .max();
+    let fixed = info.subgroup_min_size == info.subgroup_max_size;
+    let side = side.filter(|_| features.contains(needed) && fixed);
+    Some(Half { matrices: side.map(|side| Matrices { side, subgroup: info.subgroup_min_size }) })
 }
 
 fn note(slot: &Mutex<Option<String>>, what: String) {
