@@ -10,7 +10,7 @@
 //! ```
 
 use crate::Error;
-use crate::config::{ConfigError, DeviceChoice, Layered, Origin};
+use crate::config::{ConfigError, DeviceChoice, Layered, Origin, Precision};
 use crate::evaluation::Lpips;
 use crate::planar::{PlanarData, Trainer};
 use crate::radiance::{Explorer, SpaceData};
@@ -175,7 +175,7 @@ impl Experiment {
         }
         let data = PlanarData::load(&self.layered)?;
         let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings, settings.data.patches));
-        Trainer::new(settings, data, warp, self.open()?)
+        Trainer::new(settings, data, warp, self.open(settings.run.precision)?)
     }
 
     /// The same for an experiment in space.
@@ -191,7 +191,7 @@ impl Experiment {
             Lpips::check_size(data.size.width, data.size.height)?;
         }
         let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings, data.scene.train.len()));
-        let mut explorer = Explorer::new(settings, data, warp, self.open()?)?;
+        let mut explorer = Explorer::new(settings, data, warp, self.open(settings.run.precision)?)?;
         explorer.lpips = self.lpips.clone();
         Ok(explorer)
     }
@@ -224,12 +224,13 @@ impl Experiment {
         self.out.clone().unwrap_or_else(|| RunFolder::default_path(&self.layered.name, self.resume))
     }
 
-    fn open(&self) -> Result<Device, Error> {
+    fn open(&self, precision: Precision) -> Result<Device, Error> {
         let run = &self.layered.settings.run;
-        match &self.device {
-            Some(device) => Ok(device.clone()),
-            None => Ok(open_device(run.device, run.threads.limit())?),
-        }
+        let device = match &self.device {
+            Some(device) => device.clone(),
+            None => open_device(run.device, run.threads.limit())?,
+        };
+        Ok(device.with_precision(precision.into())?)
     }
 
     /// Trains until the last step is done or `stop` is set, which ends the run with a checkpoint.

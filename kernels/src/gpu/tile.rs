@@ -37,9 +37,11 @@ impl Tile {
             && n > 32
             && k >= 16
         {
-            let tile = |m, n, own_m, own_n| Tile { m, n, k: 32, own_m, own_n, matrices: Some(matrices) };
-            let wide = if n <= 64 { tile(128, 64, 32, 32) } else { tile(128, 128, 32, 64) };
-            return if enough(&wide) { wide } else { tile(64, 64, 32, 32) };
+            // Two by four matrices of a subgroup, or two by two.
+            let own = |by: u32| by * matrices.side;
+            let tile = |m, n, own_n| Tile { m, n, k: 32, own_m: own(2), own_n, matrices: Some(matrices) };
+            let wide = if n <= 64 { tile(128, 64, own(2)) } else { tile(128, 128, own(4)) };
+            return if enough(&wide) { wide } else { tile(64, 64, own(2)) };
         }
         let deep = match k {
             0..=4 => 4,
@@ -333,9 +335,14 @@ impl Sums {
                 e.b.close_loop();
             }
             Sums::Matrices { sums, first_m, first_n, sizes, .. } => {
+                // Small matrices are a loop: software drivers write out each product.
                 let side = sizes.side;
-                for step in 0..tile.k / side {
-                    let k = e.b.u(step * side);
+                let steps = if side < 16 { 1 } else { tile.k / side };
+                let (none, depth) = (e.b.u(0), e.b.u(tile.k));
+                let own_k = e.b.open_loop("own_k", none, depth, steps * side);
+                for step in 0..steps {
+                    let offset = e.b.u(step * side);
+                    let k = e.b.add(own_k, offset);
                     let at = |e: &mut Emit, first: Value, i: usize| {
                         let offset = e.b.u(i as u32 * side);
                         e.b.add(first, offset)
@@ -355,6 +362,7 @@ impl Sums {
                         }
                     }
                 }
+                e.b.close_loop();
             }
         }
     }

@@ -221,6 +221,8 @@ pub struct Run {
     pub seed: u32,
     pub device: DeviceChoice,
     pub threads: Count,
+    #[serde(default)]
+    pub precision: Precision,
     pub log_every: usize,
     pub picture_every: usize,
     pub checkpoint_every: usize,

@@ -251,6 +251,25 @@ impl<'de> Deserialize<'de> for ImageSize {
     }
 }
 
+/// How precise a run computes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    #[default]
+    F32,
+    /// Matrix products of halves, with a scaled loss.
+    Mixed,
+}
+
+impl From<Precision> for raygrad_runtime::Precision {
+    fn from(p: Precision) -> raygrad_runtime::Precision {
+        match p {
+            Precision::F32 => raygrad_runtime::Precision::F32,
+            Precision::Mixed => raygrad_runtime::Precision::Mixed,
+        }
+    }
+}
+
 /// Where a run computes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DeviceChoice {

@@ -174,7 +174,7 @@ impl PlanarModel {
     #[track_caller]
     fn updates(&self, total: &Tensor) -> Vec<(Tensor, Tensor)> {
         let warp: Vec<Parameter> = self.warp_parameters().collect();
-        let mut updates = optimise::updates(total, &self.field.parameters(), &warp);
+        let mut updates = optimise::updates(total, &self.field.parameters(), &warp, self.settings.run.precision);
         let held = self.settings.warp.fix_first && self.warp.zero_code_is_identity();
         if let Some(code) = self.code.as_ref().filter(|_| held) {
             optimise::hold_first(&mut updates, &code.tensor, &self.frame);

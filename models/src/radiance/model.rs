@@ -16,10 +16,9 @@ use super::rays::{Cameras, ImageSize, Rays, range_of};
 use super::rendering::{Purpose, Rendering, Seen};
 use crate::config::{DepthSettings, RadianceSettings, SceneSettings, Settings, TrainSettings};
 use crate::scene::View;
-use crate::training::optimise::{STEP, hold_first, updates};
+use crate::training::optimise::{STEP, hold_first, update_of, updates};
 use crate::warps::{self, Registration, Warp};
-use raygrad_compiler::autodiff::grad;
-use raygrad_compiler::functions::adam::{Adam, Moments, StepScalars};
+use raygrad_compiler::functions::adam::StepScalars;
 use raygrad_compiler::functions::lie::se3_exp;
 use raygrad_compiler::functions::loss::mean_squared_error;
 use raygrad_compiler::functions::matrix::compose_poses;
@@ -178,7 +177,8 @@ impl RadianceModel {
         outputs.extend(found.residual.map(|r| ("alignment", r)));
         outputs.extend(found.penalty.map(|(p, _)| ("penalty", p)));
         let outputs = outputs.into_iter().map(|(name, t)| (name.to_string(), t)).collect();
-        let mut updates = updates(&total, &self.rendering.parameters(), &self.warp_parameters());
+        let precision = self.settings.run.precision;
+        let mut updates = updates(&total, &self.rendering.parameters(), &self.warp_parameters(), precision);
         if let (true, Some(code)) = (pinned && self.warp.zero_code_is_identity(), &self.code) {
             hold_first(&mut updates, &code.tensor, &self.frame);
         }
@@ -211,15 +211,10 @@ impl RadianceModel {
         let seen = self.see(&rays, &Axes::new([point]), Purpose::Refinement);
         let image = Tensor::data(VIEW_IMAGE, Shape::new(&[&self.pixel], 1).with_dtype(DType::U32));
         let render = Pictures::new(&seen, &on_white(&image.take(&index, &self.pixel))).both;
-        let gradient = grad(&render, &[&twist]).remove(0);
         let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
         let scalars = StepScalars { lr: scalar(TWIST_LR), bias1: scalar(TWIST_BIAS1), bias2: scalar(TWIST_BIAS2) };
-        let old = Moments::of(&twist);
-        let (value, new) = Adam::default().update(&twist, &gradient, &old, &scalars);
-        Step {
-            outputs: vec![("render".to_string(), render)],
-            updates: vec![(twist, value), (old.m, new.m), (old.v, new.v)],
-        }
+        let updates = update_of(&render, &twist, &scalars, self.settings.run.precision);
+        Step { outputs: vec![("render".to_string(), render)], updates }
     }
 
     /// The field at `count` points of the learned world, [`DENSITY_POINTS`]: output `density`.

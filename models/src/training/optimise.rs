@@ -5,7 +5,8 @@
 //! min(1, it / `warmup_pose`): a field that knows nothing yet would only push the poses apart. (The published L2G code warms
 //! up the codes alone; here it is the whole warp.)
 
-use crate::config::Optim;
+use super::loss_scale::LossScale;
+use crate::config::{Optim, Precision};
 use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::functions::adam::{Adam, Moments, StepScalars};
 use raygrad_compiler::functions::mlp::Parameter;
@@ -55,9 +56,47 @@ impl Rates {
     }
 }
 
-/// What an Adam step makes of every trained parameter and its moments; field and warp have learning rates of their own.
+/// Gradients of a loss, computed with a scale in mixed precision; then also the scale, and a mask that says whether all of
+/// them are finite.
 #[track_caller]
-pub fn updates(total: &Tensor, field: &[Parameter], warp: &[Parameter]) -> Vec<(Tensor, Tensor)> {
+fn gradients(loss: &Tensor, wanted: &[&Tensor], precision: Precision) -> (Vec<Tensor>, Option<(LossScale, Tensor)>) {
+    if precision == Precision::F32 {
+        return (grad(loss, wanted), None);
+    }
+    let scale = LossScale::new();
+    let gradients: Vec<Tensor> = grad(&scale.scaled(loss), wanted).iter().map(|g| scale.unscaled(g)).collect();
+    let finite = LossScale::finite(&gradients);
+    (gradients, Some((scale, finite)))
+}
+
+/// What an Adam step makes of one parameter and its moments. In mixed precision the loss is scaled as the last training step
+/// would have it.
+#[track_caller]
+pub fn update_of(
+    loss: &Tensor,
+    parameter: &Tensor,
+    scalars: &StepScalars,
+    precision: Precision,
+) -> Vec<(Tensor, Tensor)> {
+    let (gradients, scale) = gradients(loss, &[parameter], precision);
+    let mut updates = adam(parameter, &gradients[0], scalars);
+    if let Some((_, finite)) = scale {
+        updates.iter_mut().for_each(|(old, new)| *new = finite.select(new, old));
+    }
+    updates
+}
+
+#[track_caller]
+fn adam(parameter: &Tensor, gradient: &Tensor, scalars: &StepScalars) -> Vec<(Tensor, Tensor)> {
+    let old = Moments::of(parameter);
+    let (value, new) = Adam::default().update(parameter, gradient, &old, scalars);
+    vec![(parameter.clone(), value), (old.m, new.m), (old.v, new.v)]
+}
+
+/// What an Adam step makes of every trained parameter and its moments; field and warp have learning rates of their own. In
+/// mixed precision the loss is scaled.
+#[track_caller]
+pub fn updates(total: &Tensor, field: &[Parameter], warp: &[Parameter], precision: Precision) -> Vec<(Tensor, Tensor)> {
     let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
     let scalars = |lr| StepScalars { lr: scalar(lr), bias1: scalar(BIAS1), bias2: scalar(BIAS2) };
     let (of_field, of_warp) = (scalars(LR_FIELD), scalars(LR_WARP));
@@ -65,12 +104,15 @@ pub fn updates(total: &Tensor, field: &[Parameter], warp: &[Parameter]) -> Vec<(
         .chain(warp.iter().map(|p| (p, &of_warp)))
         .filter_map(|(p, scalars)| p.trained.then_some((&p.tensor, scalars)))
         .collect();
-    let gradients = grad(total, &all.iter().map(|(p, _)| *p).collect::<Vec<_>>());
+    let wanted: Vec<&Tensor> = all.iter().map(|(p, _)| *p).collect();
+    let (gradients, scale) = gradients(total, &wanted, precision);
     let mut updates = vec![];
     for ((parameter, scalars), gradient) in all.into_iter().zip(&gradients) {
-        let old = Moments::of(parameter);
-        let (value, new) = Adam::default().update(parameter, gradient, &old, scalars);
-        updates.extend([(parameter.clone(), value), (old.m, new.m), (old.v, new.v)]);
+        updates.extend(adam(parameter, gradient, scalars));
+    }
+    if let Some((scale, finite)) = scale {
+        updates.iter_mut().for_each(|(old, new)| *new = finite.select(new, old));
+        updates.extend(scale.updates(&finite));
     }
     updates
 }

@@ -163,7 +163,8 @@ impl<A: Api> Executor for GpuExecutor<A> {
         if program.target.kind != TargetKind::Gpu {
             return Err(RunError::Target(program.target.kind));
         }
-        let lowered = lower(&program, &mut self.inputs, &Limits { half: self.half, ..self.api.limits() }).map_err(|e| self.lower_error(e))?;
+        let lowered = lower(&program, &mut self.inputs, &Limits { half: self.half, ..self.api.limits() })
+            .map_err(|e| self.lower_error(e))?;
         for arena in &self.inputs.arenas[self.arenas.len()..] {
             self.arenas.push(self.api.buffer(arena)?);
         }

@@ -89,7 +89,8 @@ impl Gpu {
                 extensions.push(khr::shader_float16_int8::NAME.as_ptr());
                 description = description.push_next(&mut stored).push_next(&mut computed);
                 if half.matrices.is_some() {
-                    extensions.extend([khr::cooperative_matrix::NAME, khr::vulkan_memory_model::NAME].map(CStr::as_ptr));
+                    extensions
+                        .extend([khr::cooperative_matrix::NAME, khr::vulkan_memory_model::NAME].map(CStr::as_ptr));
                     description = description.push_next(&mut multiplied).push_next(&mut model);
                 }
             }

@@ -84,6 +84,9 @@ struct Choice {
     /// Threads of the CPU backend. Results do not depend on them.
     #[arg(long, value_name = "N")]
     threads: Option<String>,
+    /// `f32`, or `mixed`: matrix products of halves, on GPUs that have them.
+    #[arg(long, value_name = "PRECISION")]
+    precision: Option<String>,
 }
 
 impl Choice {
@@ -99,6 +102,7 @@ impl Choice {
             ("--seed", "run.seed", &self.seed),
             ("--device", "run.device", &self.device),
             ("--threads", "run.threads", &self.threads),
+            ("--precision", "run.precision", &self.precision),
         ];
         set_options(&mut experiment, &options)?;
         Ok(experiment)
