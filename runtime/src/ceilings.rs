@@ -5,8 +5,13 @@ use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::{Axis, Shape, Step, Tensor, compile};
 use raygrad_kernels::cpu::peak::peak_gflops;
 use std::time::Instant;
+#[cfg(feature = "gpu")]
+use {
+    crate::gpu::Api,
+    raygrad_kernels::gpu::{self, GpuProgram, LowerError},
+};
 
-/// Lanes of the buffer that passes through: more than caches hold.
+/// Lanes of the buffer that passes through the CPU: more than caches hold.
 const LANES: usize = 16 << 20;
 const ROUNDS: usize = 5;
 
@@ -17,64 +22,84 @@ impl Device {
         match self {
             Device::Cpu { pool } => Ok(peak_gflops(pool.current_num_threads(), 150.0)),
             #[cfg(feature = "gpu")]
-            _ => {
-                let (step, operations) = multiply_adds();
-                Ok(operations / self.fastest(&step)? * 1e-9)
-            }
+            _ => self.rate(gpu::multiply_adds()),
         }
     }
 
-    /// 10^9 bytes a second to and from memory, of a buffer of 64 MiB that is read and written in place.
-    pub fn peak_gbytes(&self) -> Result<f64, RunError> {
-        Ok(8.0 * LANES as f64 / self.fastest(&copy())? * 1e-9)
+    /// 10^9 operations a second of cooperative matrices in registers; `None` unless the device is to use them.
+    pub fn peak_matrix_gflops(&self) -> Result<Option<f64>, RunError> {
+        #[cfg(feature = "gpu")]
+        if let Some(matrices) = self.half().and_then(|h| h.matrices) {
+            return Ok(Some(self.rate(gpu::matrix_products(matrices))?));
+        }
+        Ok(None)
     }
 
-    /// Seconds of the fastest of some runs, by the device's clock where it has one.
-    fn fastest(&self, step: &Step) -> Result<f64, RunError> {
+    /// 10^9 bytes a second to and from memory, of a buffer of 64 MiB.
+    pub fn peak_gbytes(&self) -> Result<f64, RunError> {
+        match self {
+            Device::Cpu { .. } => Ok(8.0 * LANES as f64 / self.fastest_pass()? * 1e-9),
+            #[cfg(feature = "gpu")]
+            _ => self.rate(gpu::copy()),
+        }
+    }
+
+    /// Seconds of the fastest of some passes over a buffer that is read, changed and written.
+    fn fastest_pass(&self) -> Result<f64, RunError> {
+        let x = Tensor::input("x", Role::State, Shape::new(&[&Axis::new("lane", LANES)], 1));
+        let step = Step { outputs: vec![], updates: vec![(x.clone(), &x * 0.5 + 1.0)] };
         let mut session = Session::new(self.clone())?;
-        let program = compile(step, &self.target())
+        let program = compile(&step, &self.target())
             .map_err(|e| RunError::Device { device: self.name(), problem: e.to_string() })?;
         let id = session.add(program)?;
         let mut best = f64::INFINITY;
-        // The first round compiles.
+        // The first round touches the memory.
         for round in 0..=ROUNDS {
             let begun = Instant::now();
-            let seconds = match session.profile(id)? {
-                Some(launches) => launches.iter().sum(),
-                None => {
-                    session.run(id)?;
-                    session.read(id, "done")?;
-                    begun.elapsed().as_secs_f64()
-                }
-            };
+            session.run(id)?;
             if round > 0 {
-                best = best.min(seconds);
+                best = best.min(begun.elapsed().as_secs_f64());
             }
         }
         Ok(best)
     }
-}
 
-/// A buffer that is read, changed and written.
-fn copy() -> Step {
-    let x = Tensor::input("x", Role::State, Shape::new(&[&Axis::new("lane", LANES)], 1));
-    let done = Tensor::scalar(1.0) * 1.0;
-    Step { outputs: vec![("done".into(), done)], updates: vec![(x.clone(), &x * 0.5 + 1.0)] }
-}
-
-/// Independent chains of multiply-adds whose factors nobody knows when compiling, and their operations.
-#[cfg(feature = "gpu")]
-fn multiply_adds() -> (Step, f64) {
-    const ELEMENTS: usize = 1 << 20;
-    const CHAINS: usize = 8;
-    const LENGTH: usize = 128;
-    let element = Axis::new("element", ELEMENTS);
-    let factor = |name: &str| Tensor::input(name, Role::State, Shape::new(&[], CHAINS));
-    let (a, b) = (factor("a"), factor("b"));
-    let mut x = Tensor::index(&element).to_f32() * &a + &b;
-    for _ in 0..LENGTH {
-        x = &x * &a + &b;
+    /// 10^9 of what a program does a second; of some runs, the fastest.
+    #[cfg(feature = "gpu")]
+    fn rate(&self, program: Result<(GpuProgram, f64), LowerError>) -> Result<f64, RunError> {
+        let problem = |e: LowerError| RunError::Device { device: self.name(), problem: e.to_string() };
+        let (program, work) = program.map_err(problem)?;
+        let seconds = match self {
+            Device::Cpu { .. } => return Err(RunError::Target(raygrad_compiler::fuse::TargetKind::Gpu)),
+            #[cfg(feature = "wgpu")]
+            Device::Wgpu { gpu, .. } => fastest(crate::wgpu::WgpuApi::new(gpu.clone()), program)?,
+            #[cfg(feature = "vulkan")]
+            Device::Vulkan { gpu, .. } => fastest(crate::vulkan::VulkanApi::new(gpu.clone())?, program)?,
+        };
+        Ok(work / seconds * 1e-9)
     }
-    let outputs = vec![("done".into(), x.sum_channels().sum(&[&element]))];
-    (Step { outputs, updates: vec![] }, 2.0 * (ELEMENTS * CHAINS * LENGTH) as f64)
+}
+
+/// Seconds of the fastest of some runs of a program without inputs, by the device's clock where it has one.
+#[cfg(feature = "gpu")]
+fn fastest<A: Api>(mut api: A, program: GpuProgram) -> Result<f64, RunError> {
+    let own = program.arenas.iter().map(|a| api.buffer(a)).collect::<Result<Vec<_>, _>>()?;
+    let loaded = api.load(program.launches, &[], &own)?;
+    let mut best = f64::INFINITY;
+    for round in 0..=ROUNDS {
+        let begun = Instant::now();
+        let seconds = match api.profile(&loaded)? {
+            Some(launches) => launches.iter().sum(),
+            None => {
+                api.submit(&loaded)?;
+                api.read(&own[0], 0, 1)?;
+                begun.elapsed().as_secs_f64()
+            }
+        };
+        // The first round compiles.
+        if round > 0 {
+            best = best.min(seconds);
+        }
+    }
+    Ok(best)
 }

@@ -11,7 +11,8 @@ use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
 use super::memory::{Emit, Position, WORKGROUP};
 use super::{Kernel, LowerError};
-use raygrad_compiler::plan::region::{InstId, Region, RegionOp, Store};
+use raygrad_compiler::plan::region::{BufferId, InstId, Region, RegionOp, Store};
+use raygrad_compiler::scalar::DType;
 
 /// Elements from which rows alone fill a device.
 const MANY: usize = 4096;
@@ -19,6 +20,12 @@ const MANY: usize = 4096;
 const WIDE: usize = 64;
 /// Instructions from which unrolling is worth avoiding.
 const LONG: usize = 2000;
+/// Elements from which four a time still fill a device.
+const MANY_FOURS: usize = 1 << 16;
+/// Instructions of an element up to which an invocation takes four.
+const SIMPLE: usize = 200;
+/// Values that are computed before they are written.
+const TOGETHER: usize = 16;
 /// Most segments of one kernel.
 const MAX_SEGMENTS: usize = 24;
 
@@ -186,18 +193,26 @@ fn kernel(
     components: &[Component],
 ) -> Result<Kernel, LowerError> {
     let elements = region.domain.elements() as u64;
+    let fours = in_fours(region, components);
     let count = |c: &Component| {
         let channels = region.inst(region.stores[c.stores[0]].values()[0]).channels as u64;
+        let elements = if fours { elements / 4 } else { elements };
         if c.by_lane { elements * channels } else { elements }
     };
     if let [only] = components {
         let (mut e, number) = Emit::over(layout, limits, count(only))?;
-        segment(&mut e, region, only, number);
+        if fours {
+            e = e.with_vectors();
+        }
+        segment(&mut e, region, only, number, fours);
         return e.finish(name);
     }
     let padded = |c: &Component| count(c).next_multiple_of(WORKGROUP as u64);
     let total = components.iter().map(padded).sum();
     let (mut e, number) = Emit::over(layout, limits, total)?;
+    if fours {
+        e = e.with_vectors();
+    }
     let mut first = 0;
     for (i, component) in components.iter().enumerate() {
         let end = first + padded(component);
@@ -214,7 +229,7 @@ fn kernel(
             let inside = e.b.less(own, count);
             e.b.open_if(inside);
         }
-        segment(&mut e, region, component, own);
+        segment(&mut e, region, component, own, fours);
         if spare {
             e.b.close_if();
         }
@@ -227,15 +242,39 @@ fn kernel(
     e.finish(name)
 }
 
+/// Whether every invocation takes four neighbouring elements: where there are many, each simple to compute.
+fn in_fours(region: &Region, components: &[Component]) -> bool {
+    use RegionOp::{ChannelSum, Const, Index, Load, Map, Pick};
+    let simple = |op: &RegionOp| matches!(op, Load(_) | Const(_) | Map(_) | Pick(_) | Index(_) | ChannelSum(_));
+    let elements = region.domain.elements();
+    elements.is_multiple_of(4)
+        && elements >= MANY_FOURS
+        && components.iter().all(|c| c.by_lane || c.size <= SIMPLE)
+        && region.body.iter().all(|i| simple(&i.op))
+}
+
 /// The statements of one component for its invocation `number`.
-fn segment(e: &mut Emit, region: &Region, component: &Component, number: Value) {
+fn segment(e: &mut Emit, region: &Region, component: &Component, number: Value, fours: bool) {
     let elements = region.domain.elements() as u32;
+    let each = if fours { 4 } else { 1 };
+    let values_at = |e: &mut Emit, first: Value| -> Values<'_> {
+        if !fours {
+            return Values::new(region, vec![Position::new(&region.domain, first)]);
+        }
+        let all = [0, 1, 2, 3].map(|i| {
+            let offset = e.b.u(i);
+            Position::new(&region.domain, e.b.add(first, offset))
+        });
+        Values::new(region, all.to_vec()).side_by_side(&region.domain)
+    };
     if component.by_lane {
-        let per_channel = e.b.u(elements);
+        let per_channel = e.b.u(elements / each);
         let (channel, element) = (e.b.div(number, per_channel), e.b.rem(number, per_channel));
+        let each = e.b.u(each);
+        let element = e.b.mul(element, each);
         e.b.name(channel, "channel");
         e.b.name(element, "element");
-        let mut values = Values::new(region, vec![Position::new(&region.domain, element)]);
+        let mut values = values_at(e, element);
         let results: Vec<Value> = component
             .stores
             .iter()
@@ -244,11 +283,13 @@ fn segment(e: &mut Emit, region: &Region, component: &Component, number: Value) 
         for (s, value) in component.stores.iter().zip(results) {
             let buffer = region.stores[*s].buffer();
             let at = e.index(buffer, channel, element);
-            e.store(buffer, at, value);
+            put(e, buffer, at, value, fours);
         }
         return;
     }
-    let mut values = Values::new(region, vec![Position::new(&region.domain, number)]);
+    let each = e.b.u(each);
+    let number = e.b.mul(number, each);
+    let mut values = values_at(e, number);
     let reads = region.reads();
     let in_place = component.stores.iter().any(|s| reads.contains(&region.stores[*s].buffer()));
     let mut late = vec![];
@@ -257,20 +298,36 @@ fn segment(e: &mut Emit, region: &Region, component: &Component, number: Value) 
         let (id, buffer) = (store.values()[0], store.buffer());
         for c in 0..region.inst(id).channels as u32 {
             let value = values.channel(e, id, Channel::At(c));
-            if in_place {
-                late.push((buffer, c, value));
-            } else {
-                write(e, buffer, c, number, value);
+            late.push((buffer, c, value));
+            // A device waits for every read that follows a write.
+            if !in_place && late.len() == TOGETHER {
+                write(e, &mut late, number, fours);
             }
         }
     }
-    for (buffer, c, value) in late {
-        write(e, buffer, c, number, value);
+    write(e, &mut late, number, fours);
+}
+
+/// Writes channels of an element, or of four.
+fn write(e: &mut Emit, results: &mut Vec<(BufferId, u32, Value)>, element: Value, fours: bool) {
+    for (buffer, c, value) in results.drain(..) {
+        let c = e.b.u(c);
+        let at = e.index(buffer, c, element);
+        put(e, buffer, at, value, fours);
     }
 }
 
-fn write(e: &mut Emit, buffer: raygrad_compiler::plan::region::BufferId, c: u32, element: Value, value: Value) {
-    let c = e.b.u(c);
-    let at = e.index(buffer, c, element);
-    e.store(buffer, at, value);
+fn put(e: &mut Emit, buffer: BufferId, at: Value, value: Value, fours: bool) {
+    if !fours {
+        e.store(buffer, at, value);
+    } else if e.layout.shape(buffer).dtype == DType::F32 {
+        e.store_four(buffer, at, value);
+    } else {
+        for i in 0..4 {
+            let offset = e.b.u(i);
+            let lane = if value.vector { e.b.component(value, i) } else { value };
+            let at = e.b.add(at, offset);
+            e.store(buffer, at, lane);
+        }
+    }
 }

@@ -4,7 +4,7 @@ use super::builder::Value;
 use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
 use super::memory::{Emit, Position, is_run};
-use super::tile::{Along, Operand, Tile, multiply, split};
+use super::tile::{Along, Four, Operand, Tile, multiply, split};
 use super::{Kernel, LowerError};
 use naga::MathFunction as Math;
 use raygrad_compiler::graph::Axes;
@@ -68,6 +68,14 @@ struct Layer<'r> {
     row_axes: Axes,
 }
 
+/// What a layer's kernel writes of one column at four rows.
+struct Found {
+    row: Value,
+    column: Value,
+    elements: Vec<Value>,
+    results: Vec<(BufferId, Value)>,
+}
+
 impl Layer<'_> {
     fn kernel(&self, layout: &Layout, limits: Limits, name: &str) -> Result<Kernel, LowerError> {
         let tile = self.tile;
@@ -99,36 +107,58 @@ impl Layer<'_> {
             (from, to),
             Operand { along: Along::Edge, load: &mut |e, k, at| self.input_vector(e, batch, first_row, k, at) },
             Operand { along, load: &mut |e, k, at| self.weight_vector(e, batch, first_column, k, at) },
-            &mut |e, at, sums| {
-                let row = e.b.add(first_row, at);
-                e.b.name(row, "row");
-                let positions = self.positions(e, batch, row);
-                let elements: Vec<Value> = positions.iter().map(|p| p.element(e, &self.region.domain)).collect();
-                let mut values = Values::new(self.region, positions);
-                if self.in_fours() {
-                    values = values.side_by_side(&self.row_axes);
-                }
-                for (at, sum) in sums {
-                    let column = e.b.add(first_column, *at);
-                    e.b.name(column, "column");
-                    let whole = count.is_multiple_of(tile.n);
-                    if !whole {
-                        let end = e.b.u(self.columns.end);
-                        let inside = e.b.less(column, end);
-                        e.b.open_if(inside);
-                    }
-                    values.give(e, self.linear, Channel::Var(column), *sum);
-                    if self.layer_columns == 1 {
-                        values.give(e, self.linear, Channel::At(0), *sum);
-                    }
-                    self.write(e, &mut values, column, row, &elements);
-                    if !whole {
-                        e.b.close_if();
-                    }
-                }
-            },
+            &mut |e, sums| self.finish(e, batch, first_row, first_column, sums),
         );
         e.finish(name)
+    }
+
+    /// Writes what follows from some sums.
+    fn finish(&self, e: &mut Emit, batch: Value, first_row: Value, first_column: Value, sums: &[Four]) {
+        let whole = (self.columns.end - self.columns.start).is_multiple_of(self.tile.n);
+        let mut all: Vec<Found> = vec![];
+        let mut rows: Option<(Value, Value, Vec<Value>, Values)> = None;
+        for four in sums {
+            // Sums of the same rows share what they compute of those.
+            let (_, row, elements, values) = match &mut rows {
+                Some(known) if known.0 == four.m => known,
+                other => {
+                    let row = e.b.add(first_row, four.m);
+                    e.b.name(row, "row");
+                    let positions = self.positions(e, batch, row);
+                    let elements = positions.iter().map(|p| p.element(e, &self.region.domain)).collect();
+                    let mut values = Values::new(self.region, positions);
+                    if self.in_fours() {
+                        values = values.side_by_side(&self.row_axes);
+                    }
+                    other.insert((four.m, row, elements, values))
+                }
+            };
+            let own = e.b.add(first_column, four.n);
+            e.b.name(own, "column");
+            let mut column = own;
+            if !whole {
+                let last = e.b.u(self.columns.end - 1);
+                column = e.b.math(Math::Min, &[own, last]);
+            }
+            values.give(e, self.linear, Channel::Var(column), four.sums);
+            if self.layer_columns == 1 {
+                values.give(e, self.linear, Channel::At(0), four.sums);
+            }
+            let stores = self.region.stores.iter();
+            let results = stores.map(|s| (s.buffer(), values.channel(e, s.values()[0], Channel::Var(column))));
+            all.push(Found { row: *row, column: own, elements: elements.clone(), results: results.collect() });
+        }
+        for found in &all {
+            if !whole {
+                let end = e.b.u(self.columns.end);
+                let inside = e.b.less(found.column, end);
+                e.b.open_if(inside);
+            }
+            self.write(e, found);
+            if !whole {
+                e.b.close_if();
+            }
+        }
     }
 
     /// Whether four neighbouring rows from a multiple of four on all exist or all do not.
@@ -244,13 +274,9 @@ impl Layer<'_> {
     }
 
     /// Writes the region's values of one column at four rows.
-    fn write(&self, e: &mut Emit, values: &mut Values, column: Value, row: Value, elements: &[Value]) {
-        let results: Vec<(BufferId, Value)> = self
-            .region
-            .stores
-            .iter()
-            .map(|s| (s.buffer(), values.channel(e, s.values()[0], Channel::Var(column))))
-            .collect();
+    fn write(&self, e: &mut Emit, found: &Found) {
+        let Found { row, column, elements, results } = found;
+        let (row, column) = (*row, *column);
         let certain = self.rows.is_multiple_of(self.tile.m);
         if self.in_fours() {
             if !certain {
@@ -258,7 +284,7 @@ impl Layer<'_> {
                 let inside = e.b.less(row, rows);
                 e.b.open_if(inside);
             }
-            for (buffer, result) in &results {
+            for (buffer, result) in results {
                 let floats = e.layout.shape(*buffer).dtype == DType::F32;
                 if floats && is_run(&self.region.domain, &self.row_axes) {
                     let at = e.index(*buffer, column, elements[0]);
@@ -279,7 +305,7 @@ impl Layer<'_> {
             let own = e.b.add(row, offset);
             let inside = e.b.less(own, rows);
             e.b.open_if(inside);
-            for result in &results {
+            for result in results {
                 self.write_lane(e, *result, column, (lane as u32, *element));
             }
             e.b.close_if();

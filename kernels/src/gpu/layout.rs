@@ -25,6 +25,8 @@ pub struct Limits {
     pub max_buffers: u32,
     /// Most workgroups along one dimension of a dispatch.
     pub max_workgroups: u32,
+    /// Memory that a workgroup may share.
+    pub max_workgroup_bytes: u32,
     /// Mixed precision: what matrix products read is stored in half precision, and sums stay in single. `None`: all is
     /// single.
     pub half: Option<Half>,
@@ -73,7 +75,13 @@ impl From<DType> for Storage {
 impl Default for Limits {
     /// What WebGPU guarantees.
     fn default() -> Limits {
-        Limits { max_binding: 128 << 20, max_buffers: 8, max_workgroups: 65535, half: None }
+        Limits {
+            max_binding: 128 << 20,
+            max_buffers: 8,
+            max_workgroups: 65535,
+            max_workgroup_bytes: 16 << 10,
+            half: None,
+        }
     }
 }
 

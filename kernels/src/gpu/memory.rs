@@ -202,12 +202,7 @@ impl<'l, 'a> Emit<'l, 'a> {
             return Err(LowerError::TooManyBuffers { kernel: name, buffers: self.bound.len(), limit, bytes });
         }
         let workgroup_size = self.b.workgroup_size;
-        let module = self.b.finish();
-        let mut validator =
-            naga::valid::Validator::new(naga::valid::ValidationFlags::all(), capabilities(self.limits.half));
-        let info = validator
-            .validate(&module)
-            .map_err(|e| LowerError::Invalid { kernel: name.clone(), message: e.emit_to_string("") })?;
+        let (module, info) = validated(self.b.finish(), self.limits.half, &name)?;
         let bindings = self.bound.iter().map(|(arena, _, writable)| Binding { arena: *arena, writable: *writable });
         Ok(Kernel { name, module, info, bindings: bindings.collect(), workgroups: self.groups, workgroup_size })
     }
@@ -216,6 +211,19 @@ impl<'l, 'a> Emit<'l, 'a> {
     pub fn spare_workgroups(&self) -> bool {
         self.groups[1] > 1
     }
+}
+
+/// A module of a kernel with what naga knows of it.
+pub(super) fn validated(
+    module: naga::Module,
+    half: Option<Half>,
+    kernel: &str,
+) -> Result<(naga::Module, naga::valid::ModuleInfo), LowerError> {
+    let mut validator = naga::valid::Validator::new(naga::valid::ValidationFlags::all(), capabilities(half));
+    let info = validator
+        .validate(&module)
+        .map_err(|e| LowerError::Invalid { kernel: kernel.into(), message: e.emit_to_string("") })?;
+    Ok((module, info))
 }
 
 /// What modules may use.

@@ -8,6 +8,7 @@
 //! | `channels`, `eval`, `scalar`, `eigen` | values of a region at a position |
 //! | `parts`, `stages` | a region cut into what one kind of kernel does, and long work into stages |
 //! | `elements`, `reduce`, `scatter`, `scan`, `layer`, `outer`, `tile` | the kinds of kernels |
+//! | `peak` | kernels that measure a device |
 
 mod builder;
 mod channels;
@@ -20,6 +21,7 @@ mod memory;
 mod naming;
 mod outer;
 mod parts;
+mod peak;
 mod reduce;
 mod scalar;
 mod scan;
@@ -28,6 +30,8 @@ mod stages;
 mod tile;
 
 pub use layout::{Arena, ArenaId, Half, Inputs, Limits, Matrices, Part, Place, Storage};
+
+pub use peak::{copy, matrix_products, multiply_adds};
 
 use layout::Layout;
 use raygrad_compiler::graph::Shape;

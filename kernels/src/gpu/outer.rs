@@ -18,7 +18,7 @@ use std::ops::Range;
 const ENOUGH: usize = 256;
 const ENOUGH_SMALL: usize = 512;
 /// Rows of a chunk, at least.
-const CHUNK_ROWS: usize = 256;
+const CHUNK_ROWS: usize = 64;
 /// Chunks, at most.
 const MAX_CHUNKS: usize = 128;
 
@@ -166,17 +166,16 @@ impl Outer {
                 along: Along::K,
                 load: &mut |e, k, at| self.rows(e, (&self.n, tile.n), keep, first_n, k, at, false),
             },
-            &mut |e, at, sums| {
-                let m = e.b.add(first_m, at);
-                for (at, sum) in sums {
-                    let n = e.b.add(first_n, *at);
+            &mut |e, sums| {
+                for four in sums {
+                    let (m, n) = (e.b.add(first_m, four.m), e.b.add(first_n, four.n));
                     let guarded = !self.n.channels.len().is_multiple_of(tile.n as usize);
                     if guarded {
                         let end = e.b.u(self.n.channels.end as u32);
                         let inside = e.b.less(n, end);
                         e.b.open_if(inside);
                     }
-                    self.write(e, m, n, *sum, keep, chunk_first);
+                    self.write(e, m, n, four.sums, keep, chunk_first);
                     if guarded {
                         e.b.close_if();
                     }

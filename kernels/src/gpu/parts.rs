@@ -15,8 +15,10 @@ use raygrad_compiler::plan::Launch;
 use raygrad_compiler::plan::region::{BufferId, Inst, InstId, Region, RegionOp, Store};
 use raygrad_compiler::scalar::DType;
 
-/// Most products of an `Outer` that single invocations accumulate.
+/// Most products of an `Outer` that are sums of their own, of one invocation or of a workgroup each.
 const SMALL_OUTER: usize = 64;
+/// The same where one side has so few channels that tiles would be mostly padding.
+const NARROW: usize = 4;
 /// Operations per element from which a value is written once rather than computed by two parts.
 const EXPENSIVE: usize = 200;
 
@@ -200,7 +202,8 @@ impl Split<'_, '_> {
     }
 
     fn small_outer(&self, x: InstId, d: InstId) -> bool {
-        self.region.inst(x).channels * self.region.inst(d).channels <= SMALL_OUTER
+        let (x, d) = (self.region.inst(x).channels, self.region.inst(d).channels);
+        x * d <= SMALL_OUTER || x.min(d) <= NARROW
     }
 
     fn push_product(&mut self, x: InstId, d: InstId) -> InstId {

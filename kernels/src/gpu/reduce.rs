@@ -1,17 +1,17 @@
 //! Sums and maxima over axes, in a fixed order, without atomics.
 //!
 //! Few rows: an invocation a result runs over them. Many rows: a workgroup takes a chunk of them, its invocations every
-//! 64th row each, and combines through workgroup memory; a second kernel combines the chunks.
+//! 64th row each (or every 64th four rows), and combines through workgroup memory; a second kernel combines the chunks.
 
 use super::builder::{Builder, Kind, Memory, Value, Var};
 use super::channels::is_indexable;
 use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
-use super::memory::{Emit, Position, WORKGROUP};
+use super::memory::{Emit, Position, WORKGROUP, is_run};
 use super::{Kernel, LowerError};
 use raygrad_compiler::graph::{Axes, Shape};
 use raygrad_compiler::ops::Reduction;
-use raygrad_compiler::plan::region::{BufferId, Region, Store};
+use raygrad_compiler::plan::region::{BufferId, Region, RegionOp, Store};
 use raygrad_compiler::scalar::DType;
 
 /// Most channels that one invocation accumulates.
@@ -21,7 +21,7 @@ const FEW_ROWS: usize = 64;
 /// Results from which invocations that sum alone fill a device.
 const MANY_RESULTS: usize = 16384;
 /// Rows of a chunk, at least.
-const CHUNK_ROWS: usize = 1024;
+const CHUNK_ROWS: usize = 2048;
 /// Chunks, at most.
 pub(super) const MAX_CHUNKS: usize = 256;
 
@@ -118,6 +118,16 @@ fn group(
     Ok(vec![first, last])
 }
 
+/// Whether a region's values can be computed at four neighbouring rows at once, most of them with one load.
+fn in_fours(layout: &Layout, region: &Region, over: &Axes) -> bool {
+    use RegionOp::{Const, Index, Load, Map, Pick, RowOuter};
+    let simple = |op: &RegionOp| matches!(op, Load(_) | Const(_) | Map(_) | Pick(_) | RowOuter | Index(_));
+    let run = |op: &RegionOp| matches!(op, Load(b) if is_run(&layout.shape(*b).axes, over));
+    over.elements().is_multiple_of(4)
+        && region.body.iter().all(|i| simple(&i.op) && i.dtype == DType::F32)
+        && region.body.iter().any(|i| run(&i.op))
+}
+
 struct Reducer<'r> {
     region: &'r Region,
     targets: &'r [Target],
@@ -129,25 +139,37 @@ struct Reducer<'r> {
 }
 
 impl Reducer<'_> {
-    fn start(&self, e: &mut Emit) -> Vec<Var> {
+    /// A total a target; with `fours`, of every fourth row each.
+    fn start(&self, e: &mut Emit, fours: bool) -> Vec<Var> {
         let mut all = vec![];
         for t in self.targets {
             let first = neutral(&mut e.b, t.kind);
+            let first = if fours { e.b.splat(first) } else { first };
             all.push(e.b.var("total", first));
         }
         all
     }
 
-    /// Adds the values at one row.
-    fn step(&self, e: &mut Emit, totals: &[Var], kept: Value, channel: Value, row: Value) {
-        let position = Position::new(&self.keep, kept).and(&self.over, row);
-        let mut values = Values::new(self.region, vec![position]);
+    /// Adds the values at one row, or with `fours` at four.
+    fn step(&self, e: &mut Emit, fours: bool, totals: &[Var], (kept, channel, row): (Value, Value, Value)) {
+        let position = |row| Position::new(&self.keep, kept).and(&self.over, row);
+        let mut values = match fours {
+            false => Values::new(self.region, vec![position(row)]),
+            true => {
+                let rows = [0, 1, 2, 3].map(|i| {
+                    let offset = e.b.u(i);
+                    e.b.add(row, offset)
+                });
+                Values::new(self.region, rows.map(position).to_vec()).side_by_side(&self.over)
+            }
+        };
         for (t, total) in self.targets.iter().zip(totals) {
             let id = self.region.stores[t.store].values()[0];
             let c = if self.by_lane { Channel::Var(channel) } else { Channel::At(t.channel) };
             let next = values.channel(e, id, c);
             let so_far = e.b.get(*total);
             let next = combine(&mut e.b, t.kind, so_far, next);
+            let next = if fours { e.b.splat(next) } else { next };
             e.b.set(*total, next);
         }
     }
@@ -168,10 +190,10 @@ impl Reducer<'_> {
         let (mut e, number) = Emit::over(layout, limits, kept_elements as u64 * self.channels as u64)?;
         let per_channel = e.b.u(kept_elements);
         let (channel, kept) = (e.b.div(number, per_channel), e.b.rem(number, per_channel));
-        let totals = self.start(&mut e);
+        let totals = self.start(&mut e, false);
         let (from, to) = (e.b.u(0), e.b.u(self.over.elements() as u32));
         let row = e.b.open_loop("row", from, to, 1);
-        self.step(&mut e, &totals, kept, channel, row);
+        self.step(&mut e, false, &totals, (kept, channel, row));
         e.b.close_loop();
         for (t, total) in self.targets.iter().zip(&totals) {
             let value = e.b.get(*total);
@@ -193,28 +215,40 @@ impl Reducer<'_> {
     ) -> Result<Kernel, LowerError> {
         let (kept_elements, rows) = (self.keep.elements(), self.over.elements());
         let results = kept_elements * self.channels;
+        let fours = in_fours(layout, self.region, &self.over);
         let mut e = Emit::new(layout, limits, (chunks * results) as u64, WORKGROUP)?;
+        if fours {
+            e = e.with_vectors();
+        }
         if e.spare_workgroups() {
             e.leave_from(e.workgroup, (chunks * results) as u32);
         }
         let (results_value, per_channel) = (e.b.u(results as u32), e.b.u(kept_elements as u32));
         let (chunk, result) = (e.b.div(e.workgroup, results_value), e.b.rem(e.workgroup, results_value));
         let (channel, kept) = (e.b.div(result, per_channel), e.b.rem(result, per_channel));
-        let totals = self.start(&mut e);
+        let totals = self.start(&mut e, fours);
         let length = e.b.u(per_chunk as u32);
         let first = e.b.mul(chunk, length);
         let end = e.b.add(first, length);
         let all = e.b.u(rows as u32);
         let end = if rows.is_multiple_of(per_chunk) { end } else { e.b.math(naga::MathFunction::Min, &[end, all]) };
-        let own = e.b.add(first, e.invocation);
-        let row = e.b.open_loop("row", own, end, WORKGROUP);
-        self.step(&mut e, &totals, kept, channel, row);
+        let each = if fours { 4 } else { 1 };
+        let each_value = e.b.u(each);
+        let own = e.b.mul(e.invocation, each_value);
+        let own = e.b.add(first, own);
+        let row = e.b.open_loop("row", own, end, each * WORKGROUP);
+        self.step(&mut e, fours, &totals, (kept, channel, row));
         e.b.close_loop();
 
         let count = self.targets.len() as u32;
         let found = e.b.workgroup("found", Kind::F32, false, count * WORKGROUP);
         for (i, total) in totals.iter().enumerate() {
-            let value = e.b.get(*total);
+            let mut value = e.b.get(*total);
+            if fours {
+                let lanes = [0, 1, 2, 3].map(|i| e.b.component(value, i));
+                let kind = self.targets[i].kind;
+                value = lanes[1..].iter().fold(lanes[0], |so_far, next| combine(&mut e.b, kind, so_far, *next));
+            }
             let first = e.b.u(i as u32 * WORKGROUP);
             let at = e.b.add(e.invocation, first);
             e.b.store(found, at, value);

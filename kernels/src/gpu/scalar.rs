@@ -1,6 +1,6 @@
 //! Scalar programs as naga expressions, on scalars or on vectors of four.
 //!
-//! Where a device's function is only loosely specified, it is built from others: Vulkan promises nothing for `sin`
+//! Where a device's function is only loosely specified, it is built from others: Vulkan promises 2^-11 for `sin`, and nothing
 //! outside `[-pi, pi]`, 4096 ulp for `atan2`, and no digits for `tanh` near 0.
 
 use super::builder::{Builder, Kind, Value};
@@ -8,6 +8,8 @@ use naga::{BinaryOperator as Op, MathFunction as Math, UnaryOperator};
 use raygrad_compiler::scalar::{Prim, ScalarProgram, Val};
 use std::f32::consts;
 
+/// `(sin(r) / r - 1) / r^2` in `r^2`, for `|r| <= pi / 2`; the CPU kernels use the same.
+const SIN: [f32; 4] = [-0.166_666_6, 0.008_333_069, -0.000_198_097_67, 2.606_047e-6];
 /// `(tanh(x) / x - 1) / x^2` in `x^2`, for `|x| <= 0.63`; the CPU kernels use the same.
 const TANH: [f32; 5] = [-0.333_332_78, 0.133_313_2, -0.053_729_13, 0.020_603_238, -0.005_663_615];
 /// `(atan(t) / t - 1) / t^2` in `t^2`, for `|t| <= 1`.
@@ -112,8 +114,8 @@ fn primitive(b: &mut Builder, prim: Prim, args: &[Value]) -> Value {
         Exp => b.math(Math::Exp, &args),
         Log => b.math(Math::Log, &args),
         Sqrt => b.math(Math::Sqrt, &args),
-        Sin => periodic(b, Math::Sin, args[0]),
-        Cos => periodic(b, Math::Cos, args[0]),
+        Sin => sine(b, args[0], 0.0),
+        Cos => sine(b, args[0], 0.5),
         Tanh => tanh(b, args[0]),
         Add | UAdd => two(b, Op::Add),
         Sub => two(b, Op::Subtract),
@@ -149,17 +151,29 @@ fn primitive(b: &mut Builder, prim: Prim, args: &[Value]) -> Value {
     }
 }
 
-/// `sin` or `cos` of an angle brought into `[-pi, pi]`, exactly where the angle is a power of two times pi.
-fn periodic(b: &mut Builder, fun: Math, x: Value) -> Value {
-    let per_turn = b.f(1.0 / consts::TAU);
-    let turns = b.mul(x, per_turn);
-    let whole = b.math(Math::Round, &[turns]);
-    // x - whole * 2 pi, with 2 pi in three parts, so that large angles keep their digits.
-    let (high, middle, low) = (b.f(-6.281_25), b.f(-1.935_005_2e-3), b.f(-3.019_916e-7));
-    let rest = b.fma(whole, high, x);
-    let rest = b.fma(whole, middle, rest);
-    let rest = b.fma(whole, low, rest);
-    b.math(fun, &[rest])
+/// `sin(x + shift pi)`, shift 0 or 1/2, as the CPU kernels compute it: hardware's own sines are off by a millionth, and more.
+///
+/// `x = q pi + r` with `q = n - shift` of a whole `n`, so that the result is `(-1)^n sin(r)`.
+fn sine(b: &mut Builder, x: Value, shift: f32) -> Value {
+    let (per_half_turn, shift) = (b.f(consts::FRAC_1_PI), b.f(shift));
+    let half_turns = b.fma(x, per_half_turn, shift);
+    let n = b.math(Math::Round, &[half_turns]);
+    let q = b.sub(n, shift);
+    // Pi in three parts, so that large angles keep their digits.
+    let (high, middle, low) = (b.f(-3.140_625), b.f(-9.675_026e-4), b.f(-1.509_958e-7));
+    let rest = b.fma(q, high, x);
+    let rest = b.fma(q, middle, rest);
+    let rest = b.fma(q, low, rest);
+    let square = b.mul(rest, rest);
+    let series = polynomial(b, square, &SIN);
+    let series = b.mul(series, square);
+    let result = b.fma(series, rest, rest);
+    let half = b.f(0.5);
+    let pairs = b.mul(n, half);
+    let below = b.math(Math::Floor, &[pairs]);
+    let odd = b.less(below, pairs);
+    let minus = b.unary(UnaryOperator::Negate, result);
+    b.select(odd, minus, result)
 }
 
 fn polynomial(b: &mut Builder, x: Value, coefficients: &[f32]) -> Value {

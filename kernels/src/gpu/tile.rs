@@ -12,6 +12,8 @@ use naga::BuiltIn;
 
 /// Workgroups that keep a device busy.
 const ENOUGH: u64 = 128;
+/// Terms of sums after which writing them does not count.
+const LONG: usize = 1024;
 
 /// Sizes of a tile.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -30,18 +32,21 @@ pub(super) struct Tile {
 impl Tile {
     /// A tile for products of `[m, k]` and `[k, n]`, so many of them: the largest that leaves enough workgroups.
     pub fn of(limits: &Limits, (m, n, k): (usize, usize, usize), products: usize) -> Tile {
-        let enough =
-            |t: &Tile| m.div_ceil(t.m as usize) as u64 * n.div_ceil(t.n as usize) as u64 * products as u64 >= ENOUGH;
-        let matrices = limits.half.and_then(|h| h.matrices);
-        if let Some(matrices) = matrices
+        let fits = |t: &Tile| {
+            let workgroups = m.div_ceil(t.m as usize) as u64 * n.div_ceil(t.n as usize) as u64 * products as u64;
+            workgroups >= ENOUGH && t.bytes() <= limits.max_workgroup_bytes
+        };
+        if let Some(matrices) = limits.half.and_then(|h| h.matrices)
             && n > 32
             && k >= 16
         {
             // Two by four matrices of a subgroup, or two by two.
-            let own = |by: u32| by * matrices.side;
-            let tile = |m, n, own_n| Tile { m, n, k: 32, own_m: own(2), own_n, matrices: Some(matrices) };
-            let wide = if n <= 64 { tile(128, 64, own(2)) } else { tile(128, 128, own(4)) };
-            return if enough(&wide) { wide } else { tile(64, 64, own(2)) };
+            let tile = |m, n, by: u32| {
+                let side = matrices.side;
+                Tile { m, n, k: 32, own_m: 2 * side, own_n: by * side, matrices: Some(matrices) }
+            };
+            let all = if n > 64 { vec![tile(128, 128, 4), tile(64, 128, 4)] } else { vec![tile(128, 64, 2)] };
+            return all.into_iter().find(fits).unwrap_or(tile(64, 64, 2));
         }
         let deep = match k {
             0..=4 => 4,
@@ -57,8 +62,20 @@ impl Tile {
             9..=16 => tile(128, 16, deep, 8, 4),
             17..=32 => tile(64, 32, deep, 8, 4),
             _ => {
-                let all = [tile(128, 128, deep.min(8), 8, 8), tile(64, 64, deep, 8, 8)];
-                all.into_iter().find(enough).unwrap_or(tile(32, 32, deep, 4, 4))
+                // Long sums write little.
+                let largest = if k >= LONG { tile(128, 128, deep, 8, 8) } else { tile(128, 64, deep.min(8), 8, 8) };
+                [largest, tile(64, 64, deep, 8, 8)].into_iter().find(fits).unwrap_or(tile(32, 32, deep, 4, 4))
+            }
+        }
+    }
+
+    /// Memory that a workgroup shares.
+    fn bytes(&self) -> u32 {
+        match self.matrices {
+            None => self.k * (self.m / 4 + 1 + self.n / 4 + 1) * 16,
+            Some(Matrices { side, subgroup }) => {
+                let staged = (self.m + self.n) * (self.k / 4 + 2) * 8;
+                staged + self.invocations() / subgroup * side * (self.own_m / 4 + 1) * 16
             }
         }
     }
@@ -93,8 +110,16 @@ pub(super) struct Operand<'a> {
     pub load: &'a mut dyn FnMut(&mut Emit, Value, Value) -> Value,
 }
 
-/// Takes sums, four neighbouring m at a time: the position in the tile of the first, and positions n with the sums there.
-pub(super) type UseSums<'a> = &'a mut dyn FnMut(&mut Emit, Value, &[(Value, Value)]);
+/// Sums of four neighbouring m of one n: the positions in the tile of the first m and of n.
+pub(super) struct Four {
+    pub m: Value,
+    pub n: Value,
+    pub sums: Value,
+}
+
+/// Takes some of the sums. What they need from memory should be read before any of them is written: a device waits for
+/// every read that follows a write.
+pub(super) type UseSums<'a> = &'a mut dyn FnMut(&mut Emit, &[Four]);
 
 /// Emits the product over `from..to` of k, and calls `use_sums` until all of the tile is given. Terms beyond `to` must come
 /// as zeros from `a`.
@@ -378,9 +403,9 @@ impl Sums {
                     let mut found = vec![];
                     for j in 0..tile.own_n {
                         let n = place(e, *row, j / 4 * down, j % 4);
-                        found.push((n, e.b.get(sums[j as usize][i as usize])));
+                        found.push(Four { m, n, sums: e.b.get(sums[j as usize][i as usize]) });
                     }
-                    use_sums(e, m, &found);
+                    use_sums(e, &found);
                 }
             }
             Sums::Matrices { sums, first_m, first_n, subgroup, sizes } => {
@@ -403,6 +428,7 @@ impl Sums {
                     }
                     e.b.barrier();
                     let vectors = tile.own_m / 4 * side;
+                    let mut found = vec![];
                     let mut done = 0;
                     while done < vectors {
                         let offset = e.b.u(done);
@@ -418,10 +444,10 @@ impl Sums {
                         let at = e.b.mul(column, line);
                         let at = e.b.add(at, vector);
                         let at = e.b.add(at, own_first);
-                        let sum = e.b.load(memory, at);
-                        use_sums(e, m, &[(n, sum)]);
+                        found.push(Four { m, n, sums: e.b.load(memory, at) });
                         done += sizes.subgroup;
                     }
+                    use_sums(e, &found);
                 }
             }
         }

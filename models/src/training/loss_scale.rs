@@ -13,6 +13,17 @@ const MOST: f64 = 16_777_216.0;
 /// Steps with finite gradients after which the scale grows.
 const PATIENCE: f64 = 1000.0;
 
+/// Sums of channels that many invocations compute, and that few do.
+const MANY: usize = 1024;
+const FEW: usize = 64;
+
+/// Sums of every `count`th channel.
+#[track_caller]
+fn grouped(x: &Tensor, count: usize) -> Tensor {
+    let all = x.channels().count() as u32;
+    x.channel_groups((0..count as u32).map(|first| (first..all).step_by(count).collect()).collect())
+}
+
 /// The scale of a step. States of the session: `loss_scale`, where 0 stands for its first value, and `loss_scale.steps`, the
 /// steps since it last changed.
 pub struct LossScale {
@@ -43,14 +54,18 @@ impl LossScale {
     }
 
     /// Whether all gradients are finite: a mask without axes. A sum of squares beyond all floats counts as infinite.
+    ///
+    /// Channels are summed in groups, because a GPU takes one invocation a sum.
     #[track_caller]
     pub fn finite(gradients: &[Tensor]) -> Tensor {
         let squares = gradients.iter().map(|g| {
-            let axes = g.axes().clone();
-            let of_channels = (g * g).sum_channels();
-            if axes.is_empty() { of_channels } else { of_channels.sum(&axes.iter().collect::<Vec<_>>()) }
+            let square = g * g;
+            let square = if g.axes().is_empty() { square } else { square.sum_over(g.axes()) };
+            let square = square.reshape(square.channels().count());
+            if square.channels().count() > MANY * FEW { grouped(&square, MANY) } else { square }
         });
-        let sum = squares.reduce(|a, b| a + b).unwrap_or_else(|| Tensor::scalar(0.0));
+        let few = squares.map(|s| if s.channels().count() > FEW { grouped(&s, FEW) } else { s.sum_channels() });
+        let sum = few.reduce(|a, b| a + b).unwrap_or_else(|| Tensor::scalar(0.0)).sum_channels();
         sum.less_equal(&Tensor::scalar(f64::from(f32::MAX)))
     }
 

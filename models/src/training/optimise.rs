@@ -57,15 +57,16 @@ impl Rates {
 }
 
 /// Gradients of a loss, computed with a scale in mixed precision; then also the scale, and a mask that says whether all of
-/// them are finite.
+/// the scaled ones are finite.
 #[track_caller]
 fn gradients(loss: &Tensor, wanted: &[&Tensor], precision: Precision) -> (Vec<Tensor>, Option<(LossScale, Tensor)>) {
     if precision == Precision::F32 {
         return (grad(loss, wanted), None);
     }
     let scale = LossScale::new();
-    let gradients: Vec<Tensor> = grad(&scale.scaled(loss), wanted).iter().map(|g| scale.unscaled(g)).collect();
-    let finite = LossScale::finite(&gradients);
+    let scaled = grad(&scale.scaled(loss), wanted);
+    let finite = LossScale::finite(&scaled);
+    let gradients = scaled.iter().map(|g| scale.unscaled(g)).collect();
     (gradients, Some((scale, finite)))
 }
 

@@ -106,6 +106,7 @@ impl Gpu {
                 max_binding: most.max_memory_allocation_size.min(properties.limits.max_storage_buffer_range as u64),
                 max_buffers: properties.limits.max_per_stage_descriptor_storage_buffers,
                 max_workgroups: properties.limits.max_compute_work_group_count[0],
+                max_workgroup_bytes: properties.limits.max_compute_shared_memory_size,
                 half: None,
             };
             let clock = (bits > 0).then(|| Clock {
