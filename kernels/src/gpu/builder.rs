@@ -646,6 +646,11 @@ impl Builder {
         self.push(Statement::ControlBarrier(naga::Barrier::WORK_GROUP));
     }
 
+    /// The same, and for storage buffers, too.
+    pub fn barrier_of_storage(&mut self) {
+        self.push(Statement::ControlBarrier(naga::Barrier::WORK_GROUP | naga::Barrier::STORAGE));
+    }
+
     pub fn leave(&mut self) {
         self.push(Statement::Return { value: None });
     }

@@ -5,16 +5,16 @@ use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
 use super::memory::{Emit, Position, is_run};
 use super::tile::{Along, Four, Operand, Tile, multiply, split};
-use super::{Kernel, LowerError};
+use super::{Kernel, LowerError, elements};
 use naga::MathFunction as Math;
-use raygrad_compiler::graph::Axes;
-use raygrad_compiler::plan::region::{BufferId, InstId, Region, RegionOp, Weights};
+use raygrad_compiler::graph::{Axes, Shape};
+use raygrad_compiler::plan::region::{BufferId, Inst, InstId, Region, RegionOp, Store, Weights};
 use raygrad_compiler::scalar::DType;
 use std::ops::Range;
 
 /// The kernels of a region whose stores all write the layer `linear` or what follows from it channel by channel.
 pub(super) fn kernels(
-    layout: &Layout,
+    layout: &mut Layout,
     limits: Limits,
     name: &str,
     region: &Region,
@@ -31,14 +31,20 @@ pub(super) fn kernels(
     let row_axes = region.domain.minus(&batch_axes);
     let stretches = split(columns);
     let several = stretches.len() > 1;
-    let mut all = vec![];
+    let rows = row_axes.elements();
+    let (mut weights, mut all) = (*weights, vec![]);
+    if limits.half.is_some_and(|h| h.matrices.is_some()) && weights.rows.min(weights.columns) > 32 && rows >= MANY_ROWS
+    {
+        let (halves, kernels) = halved(layout, limits, name, region, &weights)?;
+        all.extend(kernels);
+        weights = halves;
+    }
     for (i, stretch) in stretches.into_iter().enumerate() {
         let name = if several { format!("{name}.{}", i + 1) } else { name.to_string() };
-        let rows = row_axes.elements();
         let layer = Layer {
             region,
             linear,
-            weights: *weights,
+            weights,
             input: *input,
             tile: Tile::of(&limits, (rows, stretch.len(), terms), batch_axes.elements()),
             rows: rows as u32,
@@ -51,6 +57,42 @@ pub(super) fn kernels(
         all.push(layer.kernel(layout, limits, &name)?);
     }
     Ok(all)
+}
+
+/// Rows from which weights are read so often that they are made halves first.
+const MANY_ROWS: usize = 1 << 14;
+
+/// Weights as halves, in scratch memory that the kernels fill.
+fn halved(
+    layout: &mut Layout,
+    limits: Limits,
+    name: &str,
+    region: &Region,
+    weights: &Weights,
+) -> Result<(Weights, Vec<Kernel>), LowerError> {
+    let shape = layout.shape(weights.buffer).clone();
+    let count = weights.rows * weights.columns;
+    let halves = layout.scratch_for_product("weights", Shape::of(shape.axes.clone(), count, DType::F32))?;
+    let inst = |op, inputs, channels| Inst {
+        op,
+        inputs,
+        axes: shape.axes.clone(),
+        channels,
+        dtype: DType::F32,
+        label: "weights".into(),
+        source: std::panic::Location::caller(),
+    };
+    let mut body = vec![inst(RegionOp::Load(weights.buffer), vec![], shape.channels.count())];
+    if count < shape.channels.count() {
+        let own: Vec<(u32, u32)> = (weights.first..weights.first + count).map(|c| (0, c as u32)).collect();
+        body.push(inst(RegionOp::Pick(own.into()), vec![InstId(0)], count));
+    }
+    let value = InstId(body.len() as u32 - 1);
+    let stores = vec![Store::Write { value, buffer: halves }];
+    let inner = shape.axes.last().cloned();
+    let copy = Region { domain: shape.axes.clone(), inner, body, stores, whole: false, ..region.clone() };
+    let kernels = elements::kernels(layout, limits, &format!("{name}.halves"), &copy)?;
+    Ok((Weights { buffer: halves, first: 0, ..*weights }, kernels))
 }
 
 struct Layer<'r> {

@@ -244,6 +244,18 @@ impl<'a> Layout<'a> {
         self.scratch_stored(name, shape, storage)
     }
 
+    /// Neighbouring channels of a buffer as a buffer of their own, if it lies in one piece and they begin at a multiple of four
+    /// lanes.
+    pub fn slice(&mut self, buffer: BufferId, channels: Range<usize>) -> Option<BufferId> {
+        let (place, shape, name) = &self.buffers[buffer.0 as usize];
+        let first = channels.start * shape.axes.elements();
+        let ([part], true) = (&place.parts[..], first.is_multiple_of(4)) else { return None };
+        let part = Part { offset: part.offset + first as u32, ..*part };
+        let shape = Shape::of(shape.axes.clone(), channels.len(), shape.dtype);
+        self.buffers.push((Place { parts: vec![part], ..place.clone() }, shape, name.clone()));
+        Some(BufferId(self.buffers.len() as u32 - 1))
+    }
+
     fn scratch_stored(&mut self, name: &str, shape: Shape, storage: Storage) -> Result<BufferId, LowerError> {
         let lanes = shape.lanes() as u64;
         fits("scratch memory", lanes)?;

@@ -22,6 +22,11 @@ const NARROW: usize = 4;
 /// Operations per element from which a value is written once rather than computed by two parts.
 const EXPENSIVE: usize = 200;
 
+/// Channels of a layer from which it writes its part of a concatenation itself.
+const WIDE: usize = 16;
+/// Most parts of such a concatenation.
+const MAX_SLICES: usize = 4;
+
 enum Part {
     Elements(Region),
     Layer(Region, InstId),
@@ -105,6 +110,9 @@ impl Split<'_, '_> {
         let (writes, others): (Vec<Store>, Vec<Store>) =
             self.region.stores.clone().into_iter().partition(|s| matches!(s, Store::Write { .. }));
         self.region.stores = writes;
+        if !self.region.whole {
+            self.slice_concatenations(&others);
+        }
         let homes = Homes::of(&self.region);
         let mut on_lines = vec![];
         let mut recomputed: Vec<Store> = vec![];
@@ -138,6 +146,56 @@ impl Split<'_, '_> {
         self.late = self.sums.split_off(before);
         self.region = late;
         Ok(())
+    }
+
+    /// Lets a layer write its channels of a concatenation itself, and what lies beside them be written for itself, where
+    /// nothing else needs the whole.
+    fn slice_concatenations(&mut self, others: &[Store]) {
+        let homes = Homes::of(&self.region);
+        let reads = self.region.reads();
+        for store in std::mem::take(&mut self.region.stores) {
+            let (value, buffer) = (store.values()[0], store.buffer());
+            let used = self.region.body.iter().any(|i| i.inputs.contains(&value))
+                || self.region.stores.iter().chain(others).any(|s| s.values().contains(&value));
+            let slices = if used || reads.contains(&buffer) { None } else { self.slices(&homes, value, buffer) };
+            match slices {
+                Some(slices) => self.region.stores.extend(slices),
+                None => self.region.stores.push(store),
+            }
+        }
+    }
+
+    /// Writes of the parts of a concatenation with a layer's channels.
+    fn slices(&mut self, homes: &Homes, value: InstId, buffer: BufferId) -> Option<Vec<Store>> {
+        let inst = self.region.inst(value).clone();
+        let RegionOp::Pick(pick) = &inst.op else { return None };
+        if inst.dtype != DType::F32 || self.layout.shape(buffer).axes != self.region.domain {
+            return None;
+        }
+        let runs: Vec<&[(u32, u32)]> = pick.chunk_by(|a, b| (a.0, a.1 + 1) == *b).collect();
+        let whole = |run: &[(u32, u32)]| {
+            let operand = inst.inputs[run[0].0 as usize];
+            (run[0].1 == 0 && run.len() == self.region.inst(operand).channels).then_some(operand)
+        };
+        let of_layer = |run: &&[(u32, u32)]| {
+            run.len() >= WIDE && whole(run).is_some_and(|operand| homes.home[operand.0 as usize].is_some())
+        };
+        if runs.len() > MAX_SLICES || !runs.iter().any(of_layer) {
+            return None;
+        }
+        let operands: Vec<Option<InstId>> = runs.iter().map(|run| whole(run)).collect();
+        let (mut first, mut stores) = (0, vec![]);
+        for (run, operand) in runs.into_iter().zip(operands) {
+            let own = operand.unwrap_or_else(|| {
+                let op = RegionOp::Pick(run.into());
+                self.region.body.push(Inst { op, channels: run.len(), ..inst.clone() });
+                InstId(self.region.body.len() as u32 - 1)
+            });
+            let buffer = self.layout.slice(buffer, first..first + run.len())?;
+            stores.push(Store::Write { value: own, buffer });
+            first += run.len();
+        }
+        Some(stores)
     }
 
     /// Reductions over exactly the axis that a scan's invocations run along.

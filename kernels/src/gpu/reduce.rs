@@ -22,6 +22,10 @@ const FEW_ROWS: usize = 64;
 const MANY_RESULTS: usize = 16384;
 /// Rows of a chunk, at least.
 const CHUNK_ROWS: usize = 2048;
+/// The same where each invocation takes four rows at a time, and results alone fill a device.
+const CHUNK_ROWS_OF_FOURS: usize = 8192;
+/// Parts in which a workgroup's sums are combined.
+const EIGHTHS: u32 = 8;
 /// Chunks, at most.
 pub(super) const MAX_CHUNKS: usize = 256;
 
@@ -96,11 +100,13 @@ fn group(
     let (kept, rows) = (keep.elements(), over.elements());
     let channels = if by_lane { region.inst(region.stores[targets[0].store].values()[0]).channels } else { 1 };
     let results = kept * channels;
+    let fours = in_fours(layout, region, &over) && results >= FEW_ROWS;
     let work = Reducer { region, targets, by_lane, keep, over, channels };
     if rows <= FEW_ROWS || results >= MANY_RESULTS && rows < 32768 {
         return Ok(vec![work.alone(layout, limits, name)?]);
     }
-    let chunks = rows.div_ceil(CHUNK_ROWS).min(MAX_CHUNKS.min((MANY_RESULTS * 16).div_ceil(results)).max(1));
+    let chunk_rows = if fours { CHUNK_ROWS_OF_FOURS } else { CHUNK_ROWS };
+    let chunks = rows.div_ceil(chunk_rows).min(MAX_CHUNKS.min((MANY_RESULTS * 16).div_ceil(results)).max(1));
     let per_chunk = rows.div_ceil(chunks).next_multiple_of(WORKGROUP as usize);
     let chunks = rows.div_ceil(per_chunk);
     if chunks == 1 {
@@ -255,8 +261,21 @@ impl Reducer<'_> {
         }
         e.b.barrier();
 
-        // One invocation a target sums what the workgroup's 64 found. The code is shared by targets that follow each
-        // other, because drivers take long over many copies of a loop.
+        // Of few targets, eight invocations each sum an eighth of what the workgroup's 64 found; then, or at once, one each
+        // sums the rest. The code is shared by targets that follow each other, because drivers take long over many copies of
+        // a loop.
+        let one_kind = self.targets.iter().all(|t| t.kind == self.targets[0].kind);
+        let several = one_kind && count * EIGHTHS <= WORKGROUP;
+        if several {
+            let (length, busy) = (e.b.u(WORKGROUP / EIGHTHS), e.b.u(count * EIGHTHS));
+            let first = e.b.mul(e.invocation, length);
+            let mine = e.b.less(e.invocation, busy);
+            e.b.open_if(mine);
+            let total = self.combined(&mut e, found, first, WORKGROUP / EIGHTHS, self.targets[0].kind);
+            e.b.store(found, first, total);
+            e.b.close_if();
+            e.b.barrier();
+        }
         let size = e.b.u(WORKGROUP);
         let own = e.b.mul(e.invocation, size);
         let mut begin = 0;
@@ -271,7 +290,10 @@ impl Reducer<'_> {
                 mine = e.b.and(reached, mine);
             }
             e.b.open_if(mine);
-            let total = self.combined(&mut e, found, own, t.kind);
+            let total = match several {
+                true => self.spread(&mut e, found, own, t.kind),
+                false => self.combined(&mut e, found, own, WORKGROUP, t.kind),
+            };
             match partials {
                 Some(partials) => {
                     let count = e.b.u(count);
@@ -295,11 +317,23 @@ impl Reducer<'_> {
         e.finish(name)
     }
 
-    /// The 64 values from `first` on, combined in order.
-    fn combined(&self, e: &mut Emit, found: Memory, first: Value, kind: Reduction) -> Value {
+    /// The first values of the eighths of a target's 64, combined in order.
+    fn spread(&self, e: &mut Emit, found: Memory, first: Value, kind: Reduction) -> Value {
+        let mut total: Option<Value> = None;
+        for i in 0..EIGHTHS {
+            let offset = e.b.u(i * WORKGROUP / EIGHTHS);
+            let at = e.b.add(first, offset);
+            let next = e.b.load(found, at);
+            total = Some(total.map_or(next, |so_far| combine(&mut e.b, kind, so_far, next)));
+        }
+        total.unwrap_or(first)
+    }
+
+    /// `count` values from `first` on, combined in order.
+    fn combined(&self, e: &mut Emit, found: Memory, first: Value, count: u32, kind: Reduction) -> Value {
         let start = neutral(&mut e.b, kind);
         let total = e.b.var("all", start);
-        let (from, to) = (e.b.u(0), e.b.u(WORKGROUP));
+        let (from, to) = (e.b.u(0), e.b.u(count));
         let i = e.b.open_loop("other", from, to, 4);
         for j in 0..4 {
             let offset = e.b.u(j);

@@ -2,17 +2,24 @@
 //!
 //! A cumulative sum is a variable of the pass that computes it. Passes after it, and shifts, read it back from scratch
 //! memory, where the pass writes it.
+//!
+//! Where lines are too few to fill a device, the invocations of a workgroup share one: each runs along a stretch of it,
+//! beginning with the sum of what the ones before it have in theirs.
 
-use super::builder::{Value, Var};
+use super::builder::{Kind, Value, Var};
 use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
-use super::memory::{Emit, Position};
+use super::memory::{Emit, Position, WORKGROUP};
 use super::reduce::{combine, neutral};
 use super::{Kernel, LowerError};
 use raygrad_compiler::graph::{Axes, Axis, Shape};
 use raygrad_compiler::plan::region::{BufferId, InstId, Region, RegionOp, Store};
 use std::collections::HashMap;
 
+/// Lines that fill a device.
+const MANY_LINES: usize = 1 << 15;
+/// Shortest line that is shared.
+const SHARED: usize = 32;
 /// Most channels of a value that is the same along a line and is computed before it.
 const HOISTED: usize = 16;
 
@@ -26,8 +33,23 @@ struct Pass {
 
 struct Plan {
     passes: Vec<Pass>,
+    /// Whether a cumulative sum adds up another of the same pass.
+    chained: bool,
     /// Cumulative sums that later passes or shifts read.
     stored: HashMap<InstId, BufferId>,
+}
+
+impl Plan {
+    /// Workgroup memory for what the invocations that share a line tell each other.
+    fn shared_bytes(&self, region: &Region) -> usize {
+        let reduced = |p: &Pass| {
+            let reductions = p.stores.iter().filter(|s| matches!(s, Store::Reduce { .. }));
+            reductions.map(|s| region.inst(s.values()[0]).channels).sum::<usize>()
+        };
+        let summed = |p: &Pass| p.sums.iter().map(|s| region.inst(*s).channels).sum::<usize>();
+        let values: usize = self.passes.iter().map(|p| reduced(p) + summed(p)).sum();
+        4 * WORKGROUP as usize * values
+    }
 }
 
 /// The kernel of a region with scans. Its stores write, or reduce over exactly the scanned axis.
@@ -35,12 +57,30 @@ pub(super) fn kernel(layout: &mut Layout, limits: Limits, name: &str, region: &R
     let plan = plan(layout, region)?;
     let inner = region.inner.clone().unwrap_or_else(|| Axis::new("once", 1));
     let lines = region.domain.without(&inner);
-    let (mut e, line) = Emit::over(layout, limits, lines.elements() as u64)?;
+    let shared = lines.elements() < MANY_LINES
+        && inner.size() >= SHARED
+        && !plan.chained
+        && plan.shared_bytes(region) <= limits.max_workgroup_bytes as usize;
+    let (mut e, line) = match shared {
+        false => Emit::over(layout, limits, lines.elements() as u64)?,
+        true => {
+            let mut e = Emit::new(layout, limits, lines.elements() as u64, WORKGROUP)?;
+            if e.spare_workgroups() {
+                e.leave_from(e.workgroup, lines.elements() as u32);
+            }
+            let line = e.workgroup;
+            (e, line)
+        }
+    };
     let at_line = Position::new(&lines, line);
     let mut fixed = Values::new(region, vec![at_line.clone()]);
     let hoisted = hoist(&mut e, region, &inner, &mut fixed);
-    for pass in &plan.passes {
-        run(&mut e, region, &plan, pass, (&lines, line, &inner), &hoisted);
+    for (i, pass) in plan.passes.iter().enumerate() {
+        if shared && i > 0 {
+            // A pass may read what another invocation wrote in the one before.
+            e.b.barrier_of_storage();
+        }
+        Run { region, plan: &plan, pass, lines: &lines, line, inner: &inner, hoisted: &hoisted, shared }.emit(&mut e);
     }
     e.finish(name)
 }
@@ -65,92 +105,199 @@ fn hoist(e: &mut Emit, region: &Region, inner: &Axis, values: &mut Values) -> Ve
     all
 }
 
-fn run(
-    e: &mut Emit,
-    region: &Region,
-    plan: &Plan,
-    pass: &Pass,
-    (lines, line, inner): (&Axes, Value, &Axis),
-    hoisted: &[(InstId, u32, Value)],
-) {
-    let mut sums: Vec<(InstId, Vec<Var>)> = vec![];
-    for id in &pass.sums {
-        let zero = e.b.f(0.0);
-        let vars = (0..region.inst(*id).channels).map(|_| e.b.var("before", zero)).collect();
-        sums.push((*id, vars));
-    }
-    let mut totals: Vec<Vec<Var>> = vec![];
-    for store in &pass.stores {
-        let mut vars = vec![];
-        if let Store::Reduce { kind, value, .. } = store {
-            for _ in 0..region.inst(*value).channels {
-                let first = neutral(&mut e.b, *kind);
-                vars.push(e.b.var("total", first));
+/// A pass being written.
+struct Run<'r> {
+    region: &'r Region,
+    plan: &'r Plan,
+    pass: &'r Pass,
+    lines: &'r Axes,
+    line: Value,
+    inner: &'r Axis,
+    hoisted: &'r [(InstId, u32, Value)],
+    /// Whether a workgroup shares the line.
+    shared: bool,
+}
+
+impl<'r> Run<'r> {
+    fn emit(&self, e: &mut Emit) {
+        let mut sums: Vec<(InstId, Vec<Var>)> = vec![];
+        for id in &self.pass.sums {
+            let zero = e.b.f(0.0);
+            let vars = (0..self.region.inst(*id).channels).map(|_| e.b.var("before", zero)).collect();
+            sums.push((*id, vars));
+        }
+        let mut totals: Vec<Vec<Var>> = vec![];
+        for store in &self.pass.stores {
+            let mut vars = vec![];
+            if let Store::Reduce { kind, value, .. } = store {
+                for _ in 0..self.region.inst(*value).channels {
+                    let first = neutral(&mut e.b, *kind);
+                    vars.push(e.b.var("total", first));
+                }
+            }
+            totals.push(vars);
+        }
+        let (from, to) = self.stretch(e);
+        if self.shared && !sums.is_empty() {
+            self.begin(e, &sums, (from, to));
+        }
+        let step = e.b.open_loop("step", from, to, 1);
+        let (mut values, element) = self.values(e, step);
+        for (id, vars) in &sums {
+            for (c, var) in vars.iter().enumerate() {
+                let before = e.b.get(*var);
+                values.give(e, *id, Channel::At(c as u32), before);
             }
         }
-        totals.push(vars);
-    }
-    let size = e.b.u(inner.size() as u32);
-    let zero = e.b.u(0);
-    let step = e.b.open_loop("step", zero, size, 1);
-    let at = if pass.reverse {
-        let last = e.b.u(inner.size() as u32 - 1);
-        e.b.sub(last, step)
-    } else {
-        step
-    };
-    let position = Position::new(lines, line).with(inner, at);
-    let mut values = Values::new(region, vec![position.clone()]).reading(&plan.stored);
-    for (id, c, value) in hoisted {
-        values.give(e, *id, Channel::At(*c), *value);
-    }
-    for (id, vars) in &sums {
-        for (c, var) in vars.iter().enumerate() {
-            let before = e.b.get(*var);
-            values.give(e, *id, Channel::At(c as u32), before);
-        }
-    }
-    let element = position.element(e, &region.domain);
-    for (store, vars) in pass.stores.iter().zip(&totals) {
-        let id = store.values()[0];
-        // Only reductions have totals.
-        let mut totals = vars.iter();
-        for c in 0..region.inst(id).channels {
-            let value = values.channel(e, id, Channel::At(c as u32));
-            match (store, totals.next()) {
-                (Store::Reduce { kind, .. }, Some(total)) => {
-                    let so_far = e.b.get(*total);
-                    let next = combine(&mut e.b, *kind, so_far, value);
-                    e.b.set(*total, next);
-                }
-                _ => {
+        self.store(e, &mut values, element, &totals);
+        for (id, vars) in &sums {
+            for (c, var) in vars.iter().enumerate() {
+                let before = values.channel(e, *id, Channel::At(c as u32));
+                if let Some(buffer) = self.plan.stored.get(id) {
                     let c = e.b.u(c as u32);
-                    let to = e.index(store.buffer(), c, element);
-                    e.store(store.buffer(), to, value);
+                    let to = e.index(*buffer, c, element);
+                    e.store(*buffer, to, before);
+                }
+                let term = values.channel(e, self.region.inst(*id).inputs[0], Channel::At(c as u32));
+                let after = e.b.add(before, term);
+                e.b.set(*var, after);
+            }
+        }
+        e.b.close_loop();
+        self.finish(e, &totals);
+    }
+
+    /// The steps of this invocation.
+    fn stretch(&self, e: &mut Emit) -> (Value, Value) {
+        let size = e.b.u(self.inner.size() as u32);
+        if !self.shared {
+            return (e.b.u(0), size);
+        }
+        let length = e.b.u((self.inner.size() as u32).div_ceil(WORKGROUP));
+        let from = e.b.mul(e.invocation, length);
+        let to = e.b.add(from, length);
+        let to = e.b.math(naga::MathFunction::Min, &[to, size]);
+        (from, to)
+    }
+
+    /// Values at a step, and the element there.
+    fn values(&self, e: &mut Emit, step: Value) -> (Values<'r>, Value) {
+        let at = if self.pass.reverse {
+            let last = e.b.u(self.inner.size() as u32 - 1);
+            e.b.sub(last, step)
+        } else {
+            step
+        };
+        let position = Position::new(self.lines, self.line).with(self.inner, at);
+        let element = position.element(e, &self.region.domain);
+        let mut values = Values::new(self.region, vec![position]).reading(&self.plan.stored);
+        for (id, c, value) in self.hoisted {
+            values.give(e, *id, Channel::At(*c), *value);
+        }
+        (values, element)
+    }
+
+    /// Sets the sums to those of all stretches before this invocation's.
+    fn begin(&self, e: &mut Emit, sums: &[(InstId, Vec<Var>)], (from, to): (Value, Value)) {
+        let step = e.b.open_loop("ahead", from, to, 1);
+        let (mut values, _) = self.values(e, step);
+        for (id, vars) in sums {
+            for (c, var) in vars.iter().enumerate() {
+                let (so_far, input) = (e.b.get(*var), self.region.inst(*id).inputs[0]);
+                let term = values.channel(e, input, Channel::At(c as u32));
+                let next = e.b.add(so_far, term);
+                e.b.set(*var, next);
+            }
+        }
+        e.b.close_loop();
+        let vars: Vec<Var> = sums.iter().flat_map(|s| s.1.clone()).collect();
+        let ends = e.b.workgroup("ends", Kind::F32, false, vars.len() as u32 * WORKGROUP);
+        self.put(e, ends, &vars);
+        e.b.barrier();
+        for (i, var) in vars.iter().enumerate() {
+            let (zero, none, first) = (e.b.f(0.0), e.b.u(0), e.b.u(i as u32 * WORKGROUP));
+            e.b.set(*var, zero);
+            let other = e.b.open_loop("other", none, e.invocation, 1);
+            let at = e.b.add(first, other);
+            let (so_far, next) = (e.b.get(*var), e.b.load(ends, at));
+            let next = e.b.add(so_far, next);
+            e.b.set(*var, next);
+            e.b.close_loop();
+        }
+    }
+
+    /// Every invocation's values of some variables, one after the other, to workgroup memory.
+    fn put(&self, e: &mut Emit, memory: super::builder::Memory, vars: &[Var]) {
+        for (i, var) in vars.iter().enumerate() {
+            let (value, first) = (e.b.get(*var), e.b.u(i as u32 * WORKGROUP));
+            let at = e.b.add(e.invocation, first);
+            e.b.store(memory, at, value);
+        }
+    }
+
+    /// What the stores write or add up at a step.
+    fn store(&self, e: &mut Emit, values: &mut Values, element: Value, totals: &[Vec<Var>]) {
+        for (store, vars) in self.pass.stores.iter().zip(totals) {
+            let id = store.values()[0];
+            // Only reductions have totals.
+            let mut totals = vars.iter();
+            for c in 0..self.region.inst(id).channels {
+                let value = values.channel(e, id, Channel::At(c as u32));
+                match (store, totals.next()) {
+                    (Store::Reduce { kind, .. }, Some(total)) => {
+                        let so_far = e.b.get(*total);
+                        let next = combine(&mut e.b, *kind, so_far, value);
+                        e.b.set(*total, next);
+                    }
+                    _ => {
+                        let c = e.b.u(c as u32);
+                        let to = e.index(store.buffer(), c, element);
+                        e.store(store.buffer(), to, value);
+                    }
                 }
             }
         }
     }
-    for (id, vars) in &sums {
-        for (c, var) in vars.iter().enumerate() {
-            let before = values.channel(e, *id, Channel::At(c as u32));
-            if let Some(buffer) = plan.stored.get(id) {
-                let c = e.b.u(c as u32);
-                let to = e.index(*buffer, c, element);
-                e.store(*buffer, to, before);
-            }
-            let term = values.channel(e, region.inst(*id).inputs[0], Channel::At(c as u32));
-            let after = e.b.add(before, term);
-            e.b.set(*var, after);
+
+    /// Writes the totals of the line.
+    fn finish(&self, e: &mut Emit, totals: &[Vec<Var>]) {
+        let all: Vec<Var> = totals.concat();
+        if all.is_empty() {
+            return;
         }
-    }
-    e.b.close_loop();
-    for (store, vars) in pass.stores.iter().zip(&totals) {
-        for (c, var) in vars.iter().enumerate() {
-            let value = e.b.get(*var);
-            let c = e.b.u(c as u32);
-            let to = e.index(store.buffer(), c, line);
-            e.store(store.buffer(), to, value);
+        let found = self.shared.then(|| {
+            let found = e.b.workgroup("found", Kind::F32, false, all.len() as u32 * WORKGROUP);
+            self.put(e, found, &all);
+            e.b.barrier();
+            found
+        });
+        let mut number = 0;
+        for (store, vars) in self.pass.stores.iter().zip(totals) {
+            let Store::Reduce { kind, .. } = store else { continue };
+            for (c, var) in vars.iter().enumerate() {
+                if let Some(found) = found {
+                    let own = e.b.u(number % WORKGROUP);
+                    let mine = e.b.binary(naga::BinaryOperator::Equal, e.invocation, own);
+                    e.b.open_if(mine);
+                    let (one, size, first) = (e.b.u(0), e.b.u(WORKGROUP), e.b.u(number * WORKGROUP));
+                    let start = neutral(&mut e.b, *kind);
+                    e.b.set(*var, start);
+                    let other = e.b.open_loop("other", one, size, 1);
+                    let at = e.b.add(first, other);
+                    let (so_far, next) = (e.b.get(*var), e.b.load(found, at));
+                    let next = combine(&mut e.b, *kind, so_far, next);
+                    e.b.set(*var, next);
+                    e.b.close_loop();
+                }
+                let value = e.b.get(*var);
+                let c = e.b.u(c as u32);
+                let to = e.index(store.buffer(), c, self.line);
+                e.store(store.buffer(), to, value);
+                if found.is_some() {
+                    e.b.close_if();
+                }
+                number += 1;
+            }
         }
     }
 }
@@ -164,6 +311,7 @@ fn plan(layout: &mut Layout, region: &Region) -> Result<Plan, LowerError> {
     let mut depends: Vec<Vec<InstId>> = vec![vec![]; n];
     let mut pass_of: HashMap<InstId, usize> = HashMap::new();
     let mut kept: Vec<InstId> = vec![];
+    let mut chained = false;
     for id in region.ids() {
         let (at, inst) = (id.0 as usize, region.inst(id));
         let inputs = || inst.inputs.iter().map(|i| i.0 as usize);
@@ -179,6 +327,7 @@ fn plan(layout: &mut Layout, region: &Region) -> Result<Plan, LowerError> {
                     passes.len() - 1
                 });
                 passes[pass].sums.push(id);
+                chained |= sums.iter().any(|s| pass_of[s] == pass);
                 kept.extend(sums.iter().filter(|s| pass_of[s] < pass));
                 pass_of.insert(id, pass);
                 here[at] = pass;
@@ -210,5 +359,5 @@ fn plan(layout: &mut Layout, region: &Region) -> Result<Plan, LowerError> {
             new.insert(layout.scratch("cumulative", shape)?);
         }
     }
-    Ok(Plan { passes, stored })
+    Ok(Plan { passes, chained, stored })
 }

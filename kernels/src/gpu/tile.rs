@@ -40,13 +40,19 @@ impl Tile {
             && n > 32
             && k >= 16
         {
-            // Two by four matrices of a subgroup, or two by two.
-            let tile = |m, n, by: u32| {
-                let side = matrices.side;
-                Tile { m, n, k: 32, own_m: 2 * side, own_n: by * side, matrices: Some(matrices) }
+            // Blocks of a subgroup, in matrices.
+            let side = matrices.side;
+            let tile = |m, n, (own_m, own_n): (u32, u32)| {
+                let (own_m, own_n) = (own_m * side, own_n * side);
+                Tile { m, n, k: 32, own_m, own_n, matrices: Some(matrices) }
             };
-            let all = if n > 64 { vec![tile(128, 128, 4), tile(64, 128, 4)] } else { vec![tile(128, 64, 2)] };
-            return all.into_iter().find(fits).unwrap_or(tile(64, 64, 2));
+            let all = match n {
+                0..=64 => vec![tile(128, 64, (2, 2))],
+                65..=128 => vec![tile(256, 128, (4, 4)), tile(64, 128, (2, 4))],
+                // All columns at once: the other operand is then read once.
+                _ => vec![tile(128, 256, (4, 4)), tile(64, 128, (2, 4))],
+            };
+            return all.into_iter().find(fits).unwrap_or(tile(64, 64, (2, 2)));
         }
         let deep = match k {
             0..=4 => 4,
@@ -75,9 +81,14 @@ impl Tile {
             None => self.k * (self.m / 4 + 1 + self.n / 4 + 1) * 16,
             Some(Matrices { side, subgroup }) => {
                 let staged = (self.m + self.n) * (self.k / 4 + 2) * 8;
-                staged + self.invocations() / subgroup * side * (self.own_m / 4 + 1) * 16
+                staged + self.invocations() / subgroup * side * (self.strip(side) / 4 + 1) * 16
             }
         }
+    }
+
+    /// Rows of sums that a subgroup passes through workgroup memory at a time: of two matrices.
+    fn strip(&self, side: u32) -> u32 {
+        self.own_m.min(2 * side)
     }
 
     pub fn invocations(&self) -> u32 {
@@ -409,9 +420,10 @@ impl Sums {
                 }
             }
             Sums::Matrices { sums, first_m, first_n, subgroup, sizes } => {
-                // One column of matrices after the other, in memory of each subgroup's own: columns of `own_m` floats.
+                // A few matrices after the other, in memory of each subgroup's own.
                 let side = sizes.side;
-                let line = tile.own_m / 4 + 1;
+                let strip = tile.strip(side);
+                let line = strip / 4 + 1;
                 let own = side * line;
                 let subgroups = tile.invocations() / sizes.subgroup;
                 let memory = e.b.workgroup("block", Kind::F32, true, subgroups * own);
@@ -420,34 +432,34 @@ impl Sums {
                 let count = e.b.u(sizes.subgroup);
                 let lane = e.b.rem(e.invocation, count);
                 for (j, sums) in sums.iter().enumerate() {
-                    e.b.barrier();
-                    for (i, sum) in sums.iter().enumerate() {
-                        let offset = e.b.u(i as u32 * side / 4);
-                        let first = e.b.add(own_first, offset);
-                        e.b.matrix_store(*sum, MatrixAt { memory, first, line, row_major: false });
+                    for (i, sums) in sums.chunks((strip / side) as usize).enumerate() {
+                        e.b.barrier();
+                        for (i, sum) in sums.iter().enumerate() {
+                            let offset = e.b.u(i as u32 * side / 4);
+                            let first = e.b.add(own_first, offset);
+                            e.b.matrix_store(*sum, MatrixAt { memory, first, line, row_major: false });
+                        }
+                        e.b.barrier();
+                        let mut found = vec![];
+                        for done in (0..strip / 4 * side).step_by(sizes.subgroup as usize) {
+                            let offset = e.b.u(done);
+                            let number = e.b.add(lane, offset);
+                            let (down, four) = (e.b.u(strip / 4), e.b.u(4));
+                            let (vector, column) = (e.b.rem(number, down), e.b.div(number, down));
+                            let (own_m, before_m) = (e.b.mul(vector, four), e.b.u(i as u32 * strip));
+                            let m = e.b.add(*first_m, before_m);
+                            let m = e.b.add(m, own_m);
+                            let before_n = e.b.u(j as u32 * side);
+                            let n = e.b.add(*first_n, before_n);
+                            let n = e.b.add(n, column);
+                            let line = e.b.u(line);
+                            let at = e.b.mul(column, line);
+                            let at = e.b.add(at, vector);
+                            let at = e.b.add(at, own_first);
+                            found.push(Four { m, n, sums: e.b.load(memory, at) });
+                        }
+                        use_sums(e, &found);
                     }
-                    e.b.barrier();
-                    let vectors = tile.own_m / 4 * side;
-                    let mut found = vec![];
-                    let mut done = 0;
-                    while done < vectors {
-                        let offset = e.b.u(done);
-                        let number = e.b.add(lane, offset);
-                        let (down, four) = (e.b.u(tile.own_m / 4), e.b.u(4));
-                        let (vector, column) = (e.b.rem(number, down), e.b.div(number, down));
-                        let own_m = e.b.mul(vector, four);
-                        let m = e.b.add(*first_m, own_m);
-                        let before = e.b.u(j as u32 * side);
-                        let n = e.b.add(*first_n, before);
-                        let n = e.b.add(n, column);
-                        let line = e.b.u(line);
-                        let at = e.b.mul(column, line);
-                        let at = e.b.add(at, vector);
-                        let at = e.b.add(at, own_first);
-                        found.push(Four { m, n, sums: e.b.load(memory, at) });
-                        done += sizes.subgroup;
-                    }
-                    use_sums(e, &found);
                 }
             }
         }

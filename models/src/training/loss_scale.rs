@@ -62,7 +62,7 @@ impl LossScale {
             let square = g * g;
             let square = if g.axes().is_empty() { square } else { square.sum_over(g.axes()) };
             let square = square.reshape(square.channels().count());
-            if square.channels().count() > MANY * FEW { grouped(&square, MANY) } else { square }
+            if square.channels().count() > 4 * MANY { grouped(&square, MANY) } else { square }
         });
         let few = squares.map(|s| if s.channels().count() > FEW { grouped(&s, FEW) } else { s.sum_channels() });
         let sum = few.reduce(|a, b| a + b).unwrap_or_else(|| Tensor::scalar(0.0)).sum_channels();
