@@ -1,5 +1,6 @@
-//! Training steps at the papers' sizes on this machine's GPU: raygrad through wgpu and Vulkan against PyTorch on the same
-//! device, alternating in one run, and against the rates that the device reaches at best. Writes one Markdown file.
+//! Training steps at the papers' sizes on this machine's GPU: raygrad through wgpu and Vulkan, in single and in mixed
+//! precision, against PyTorch on the same device, alternating in one run, and against the rates that the device reaches at
+//! best. Writes one Markdown file.
 //!
 //! Every number is a median over rounds. PyTorch runs f32 with TF32 off, which is its default.
 
@@ -23,6 +24,9 @@ struct Args {
     /// What `raygrad --device` takes.
     #[arg(long, default_value = "wgpu,vulkan", value_delimiter = ',')]
     devices: Vec<String>,
+    /// What `raygrad --precision` takes.
+    #[arg(long, default_value = "f32,mixed", value_delimiter = ',')]
+    precisions: Vec<String>,
     /// A share of the papers' sizes, where the device is slow or small.
     #[arg(long, default_value_t = 1.0)]
     scale: f64,
@@ -77,6 +81,7 @@ struct Bench {
     seconds_per_step: f64,
     gflop_per_step: f64,
     peak_gflops: f64,
+    peak_matrix_gflops: Option<f64>,
     peak_gbytes: f64,
     host_seconds_per_step: f64,
     per_launch: Vec<Launch>,
@@ -99,13 +104,16 @@ fn main() -> anyhow::Result<()> {
     let peers = if has_gpu { &PEERS[..] } else { &[] };
     let (mut text, mut device) = (String::new(), String::new());
     for work in &WORKS {
-        let mut own: BTreeMap<&str, Vec<Bench>> = BTreeMap::new();
+        let mut own: BTreeMap<String, Vec<Bench>> = BTreeMap::new();
         let mut others: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
         for round in 1..=args.rounds {
-            for name in &args.devices {
-                let bench = args.own(work, name)?;
-                eprintln!("round {round}: {} on {name} {:.4} s", work.preset, bench.seconds_per_step);
-                own.entry(name).or_default().push(bench);
+            for device in &args.devices {
+                for precision in &args.precisions {
+                    let Some(bench) = args.own(work, device, precision)? else { continue };
+                    let name = format!("{device}, {precision}");
+                    eprintln!("round {round}: {} on {name} {:.4} s", work.preset, bench.seconds_per_step);
+                    own.entry(name).or_default().push(bench);
+                }
             }
             let rows = own.values().flatten().last().map_or(0, |b| b.rows);
             for (name, options) in peers {
@@ -119,8 +127,7 @@ fn main() -> anyhow::Result<()> {
     }
     let words: Vec<&str> = device.split(|c: char| !c.is_ascii_alphanumeric()).filter(|w| !w.is_empty()).collect();
     let file = args.out.join(format!("{}.md", words.join("-")));
-    let head =
-        format!("# {device}\n\n`benches/gpu.sh --rounds {} --scale {}`, f32, medians.\n", args.rounds, args.scale);
+    let head = format!("# {device}\n\n`benches/gpu.sh --rounds {} --scale {}`, medians.\n", args.rounds, args.scale);
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
     std::fs::write(&file, head + &text).with_context(|| format!("cannot write {}", file.display()))?;
     print!("{text}");
@@ -129,10 +136,11 @@ fn main() -> anyhow::Result<()> {
 }
 
 impl Args {
-    fn own(&self, work: &Work, device: &str) -> anyhow::Result<Bench> {
+    /// `None` where the device lacks the precision.
+    fn own(&self, work: &Work, device: &str, precision: &str) -> anyhow::Result<Option<Bench>> {
         let rows = if quick() { 64.0 } else { (work.rows * self.scale).round() };
         let mut command = self.programs.bench(work.preset);
-        command.args(["--launches", "--device", device]);
+        command.args(["--launches", "--device", device, "--precision", precision]);
         command.args(["--set", &format!("{}={rows}", work.setting)]);
         if quick() {
             command.args(["--steps", "1", "--set", "field.layers=[16,16]"]);
@@ -142,7 +150,10 @@ impl Args {
                 command.args(["--set", "radiance.skip=[]", "--set", "train.samples=8"]);
             }
         }
-        Ok(serde_json::from_str(&output(command)?)?)
+        match output(command) {
+            Err(e) if format!("{e:#}").contains("no half precision") => Ok(None),
+            found => Ok(Some(serde_json::from_str(&found?)?)),
+        }
     }
 
     /// Seconds of a step in PyTorch, on as many points of a patch, or rays.
@@ -157,7 +168,7 @@ impl Args {
 fn report(
     text: &mut String,
     work: &Work,
-    own: &BTreeMap<&str, Vec<Bench>>,
+    own: &BTreeMap<String, Vec<Bench>>,
     others: &BTreeMap<&str, Vec<f64>>,
 ) -> std::fmt::Result {
     let of = |runs: &[Bench], f: fn(&Bench) -> f64| median(&runs.iter().map(f).collect::<Vec<_>>());
@@ -166,12 +177,16 @@ fn report(
     let best = |f: fn(&Bench) -> f64| median(&all.iter().map(|b| f(b)).collect::<Vec<_>>());
     let (peak, bytes) = (best(|b| b.peak_gflops), best(|b| b.peak_gbytes));
     writeln!(text, "\n## {} ({} rows)\n", work.title, last.rows)?;
+    let matrices: Vec<f64> = all.iter().filter_map(|b| b.peak_matrix_gflops).collect();
+    let matrices = (!matrices.is_empty()).then(|| median(&matrices));
+    let products = matrices.map_or(String::new(), |m| format!("{m:.0} GFLOP/s of cooperative matrices, "));
     writeln!(
         text,
-        "At best: {peak:.0} GFLOP/s of f32 multiply-adds, {bytes:.0} GB/s of memory, both measured here.\n"
+        "At best: {peak:.0} GFLOP/s of f32 multiply-adds, {products}{bytes:.0} GB/s of memory, all measured here.\n"
     )?;
     let hours = format!("{:.0} steps, min", work.steps);
-    let mut table = Table::new(&["program", "ms a step", "GFLOP/s", "of f32 at best", "host, us", &hours]);
+    let heads = ["program", "ms a step", "GFLOP/s", "of f32 at best", "of matrices at best", "host, us", &hours];
+    let mut table = Table::new(&heads);
     let mut row = |name: String, seconds: f64, host: Option<f64>| {
         let rate = last.gflop_per_step / seconds;
         table.row([
@@ -179,6 +194,7 @@ fn report(
             format!("{:.2}", 1e3 * seconds),
             format!("{rate:.0}"),
             format!("{:.0} %", 100.0 * rate / peak),
+            matrices.map_or(String::new(), |m| format!("{:.0} %", 100.0 * rate / m)),
             host.map_or(String::new(), |s| format!("{:.0}", 1e6 * s)),
             format!("{:.1}", seconds * work.steps / 60.0),
         ]);
@@ -192,7 +208,8 @@ fn report(
     }
     write!(text, "{table}")?;
     for (device, runs) in own {
-        launches(text, device, &runs[runs.len() - 1], peak, bytes)?;
+        let last = &runs[runs.len() - 1];
+        launches(text, device, last, last.peak_matrix_gflops.unwrap_or(peak), bytes)?;
     }
     Ok(())
 }
@@ -209,7 +226,8 @@ fn launches(text: &mut String, device: &str, bench: &Bench, peak: f64, bytes: f6
         bench.launches,
         1e3 * total
     )?;
-    let mut table = Table::new(&["launch", "ms", "share", "of f32 at best", "of memory at best"]);
+    let arithmetic = if bench.peak_matrix_gflops.is_some() { "of matrices at best" } else { "of f32 at best" };
+    let mut table = Table::new(&["launch", "ms", "share", arithmetic, "of memory at best"]);
     for l in slowest.into_iter().take(SHOWN) {
         table.row([
             l.name.clone(),

@@ -1,10 +1,10 @@
 //! Devices: what programs run on.
 
 use crate::DeviceError;
-use raygrad_compiler::Target;
+use raygrad_compiler::{Program, Target};
 use raygrad_kernels::cpu::Isa;
 #[cfg(feature = "gpu")]
-use raygrad_kernels::gpu::Half;
+use raygrad_kernels::gpu::{Half, Limits, storages};
 use std::sync::Arc;
 
 /// A device to run sessions on.
@@ -148,6 +148,16 @@ impl Device {
             #[cfg(feature = "vulkan")]
             Device::Vulkan { half, .. } => *half,
         }
+    }
+
+    /// Bytes of a lane of each of a program's buffers, by id.
+    pub fn lane_bytes(&self, program: &Program) -> Vec<u64> {
+        #[cfg(feature = "gpu")]
+        if self.half().is_some() {
+            let limits = Limits { half: self.half(), ..Limits::default() };
+            return storages(program, &limits).iter().map(|s| s.bytes()).collect();
+        }
+        vec![4; program.buffers.len()]
     }
 
     /// What to compile programs for.

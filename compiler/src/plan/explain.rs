@@ -30,9 +30,14 @@ pub(super) fn launch_name(index: usize, region: &Region) -> String {
 impl Program {
     /// Bytes a launch moves to and from memory: every buffer it touches, once.
     pub fn launch_bytes(&self, index: usize) -> u64 {
+        self.launch_bytes_of(index, |_| 4)
+    }
+
+    /// The same where a lane of a buffer has so many bytes.
+    pub fn launch_bytes_of(&self, index: usize, of_lane: impl Fn(super::region::BufferId) -> u64) -> u64 {
         let region = &self.launches[index].region;
         let written = region.stores.iter().map(|s| s.buffer());
-        region.reads().into_iter().chain(written).map(|b| 4 * self.buffer(b).shape.lanes() as u64).sum()
+        region.reads().into_iter().chain(written).map(|b| of_lane(b) * self.buffer(b).shape.lanes() as u64).sum()
     }
 
     /// Bytes of all buffers, temporaries of one slot counted once.

@@ -171,21 +171,18 @@ impl<'a> Layout<'a> {
         let mut layout =
             Layout { inputs, own: vec![], buffers: vec![], max_lanes, half: limits.half.is_some(), scratch: vec![] };
         layout.inputs.sealed = layout.inputs.arenas.len();
-        let multiplied = multiplied(program);
         // A slot may hold floats for some launches and halves for others.
         let mut slots: BTreeMap<(usize, bool), Place> = BTreeMap::new();
-        for (buffer, multiplied) in program.buffers.iter().zip(multiplied) {
+        for (buffer, storage) in program.buffers.iter().zip(storages(program, limits)) {
             let lanes = buffer.shape.lanes() as u64;
-            let half = layout.half && multiplied && may_be_half(&buffer.shape);
-            let storage = if half { Storage::F16 } else { buffer.shape.dtype.into() };
             fits(&buffer.label, lanes)?;
             let place = match &buffer.kind {
                 BufferKind::Input { name, role } => layout.input(name, *role, &buffer.shape)?,
-                BufferKind::Output => layout.allocate("work", buffer.shape.dtype.into(), lanes),
+                BufferKind::Output => layout.allocate("work", storage, lanes),
                 // Integers lie among integers and share no slot: their bits must not pass through float registers.
                 BufferKind::Temporary { .. } if storage == Storage::U32 => layout.allocate("work", storage, lanes),
                 BufferKind::Temporary { slot } => slots
-                    .entry((*slot, half))
+                    .entry((*slot, storage == Storage::F16))
                     .or_insert_with(|| layout.allocate("work", storage, program.slots[*slot] as u64))
                     .clone(),
             };
@@ -327,6 +324,18 @@ const WIDE: usize = 16;
 
 fn may_be_half(shape: &Shape) -> bool {
     shape.dtype == DType::F32 && shape.channels.count() >= WIDE
+}
+
+/// How the buffers of a program are stored, by id.
+pub fn storages(program: &Program, limits: &Limits) -> Vec<Storage> {
+    let one = |(buffer, multiplied): (&raygrad_compiler::plan::Buffer, bool)| {
+        let temporary = matches!(buffer.kind, BufferKind::Temporary { .. });
+        match limits.half.is_some() && temporary && multiplied && may_be_half(&buffer.shape) {
+            true => Storage::F16,
+            false => buffer.shape.dtype.into(),
+        }
+    };
+    program.buffers.iter().zip(multiplied(program)).map(one).collect()
 }
 
 /// Which buffers of a program a matrix product reads: it rounds them in any case.

@@ -2,12 +2,13 @@
 
 use super::builder::{Builder, Kind, Memory, Value};
 use super::layout::{Arena, ArenaId, Half, Layout, Limits, Part, Place, Storage};
-use super::{Binding, Kernel, LowerError};
+use super::{Access, Binding, Kernel, LowerError};
 use naga::BuiltIn;
 use naga::valid::Capabilities;
 use raygrad_compiler::graph::{Axes, Axis};
 use raygrad_compiler::plan::region::BufferId;
 use raygrad_compiler::scalar::DType;
+use std::collections::BTreeSet;
 
 /// Invocations in a workgroup, unless a kernel needs another number.
 pub(super) const WORKGROUP: u32 = 64;
@@ -16,6 +17,8 @@ pub(super) struct Emit<'l, 'a> {
     pub b: Builder,
     pub layout: &'l Layout<'a>,
     bound: Vec<(ArenaId, Memory, bool)>,
+    /// Buffers that the kernel reads (false) or writes (true).
+    touched: BTreeSet<(BufferId, bool)>,
     /// Workgroup number in a dispatch of one dimension.
     pub workgroup: Value,
     /// Number of the invocation in its workgroup.
@@ -45,7 +48,17 @@ impl<'l, 'a> Emit<'l, 'a> {
             workgroup = b.add(before, workgroup);
         }
         let groups = [columns as u32, rows.max(1) as u32, 1];
-        Ok(Emit { b, layout, bound: vec![], workgroup, invocation, groups, limits, vectors: false })
+        Ok(Emit {
+            b,
+            layout,
+            bound: vec![],
+            touched: BTreeSet::new(),
+            workgroup,
+            invocation,
+            groups,
+            limits,
+            vectors: false,
+        })
     }
 
     /// Binds float arenas as vectors of four lanes, for kernels that mostly access four neighbours at once.
@@ -96,6 +109,7 @@ impl<'l, 'a> Emit<'l, 'a> {
 
     /// Lane `index` of a buffer.
     pub fn load(&mut self, buffer: BufferId, index: Value) -> Value {
+        self.touched.insert((buffer, false));
         let place = self.layout.place(buffer);
         if let [part] = place.parts[..] {
             return self.load_part(part, index);
@@ -112,6 +126,7 @@ impl<'l, 'a> Emit<'l, 'a> {
 
     /// Four neighbouring lanes of a buffer of floats, from a multiple of four on, in a kernel `with_vectors`.
     pub fn load_four(&mut self, buffer: BufferId, index: Value) -> Value {
+        self.touched.insert((buffer, false));
         let place = self.layout.place(buffer);
         if let [part] = place.parts[..] {
             return self.load_four_of(part, index);
@@ -128,6 +143,7 @@ impl<'l, 'a> Emit<'l, 'a> {
 
     /// Sets four neighbouring lanes of a buffer of floats, as [`Emit::load_four`] reads them.
     pub fn store_four(&mut self, buffer: BufferId, index: Value, value: Value) {
+        self.touched.insert((buffer, true));
         let place = self.layout.place(buffer);
         let value = self.b.splat(value);
         self.in_part(place, index, &mut |e, part, index| {
@@ -138,6 +154,7 @@ impl<'l, 'a> Emit<'l, 'a> {
     }
 
     pub fn store(&mut self, buffer: BufferId, index: Value, value: Value) {
+        self.touched.insert((buffer, true));
         let place = self.layout.place(buffer);
         self.in_part(place, index, &mut |e, part, index| {
             let memory = e.memory(part.arena, true);
@@ -204,7 +221,17 @@ impl<'l, 'a> Emit<'l, 'a> {
         let workgroup_size = self.b.workgroup_size;
         let (module, info) = validated(self.b.finish(), self.limits.half, &name)?;
         let bindings = self.bound.iter().map(|(arena, _, writable)| Binding { arena: *arena, writable: *writable });
-        Ok(Kernel { name, module, info, bindings: bindings.collect(), workgroups: self.groups, workgroup_size })
+        let mut accesses = vec![];
+        for (buffer, write) in &self.touched {
+            let place = self.layout.place(*buffer);
+            let pieces = place.pieces(0..self.layout.shape(*buffer).lanes());
+            accesses.extend(pieces.into_iter().map(|(part, lanes)| {
+                let first = u64::from(part.offset);
+                Access { arena: part.arena, lanes: first..first + lanes.len() as u64, write: *write }
+            }));
+        }
+        let (bindings, workgroups) = (bindings.collect(), self.groups);
+        Ok(Kernel { name, module, info, bindings, accesses, workgroups, workgroup_size })
     }
 
     /// Whether the dispatch has more workgroups than were asked for.

@@ -29,19 +29,53 @@ mod scatter;
 mod stages;
 mod tile;
 
-pub use layout::{Arena, ArenaId, Half, Inputs, Limits, Matrices, Part, Place, Storage};
+pub use layout::{Arena, ArenaId, Half, Inputs, Limits, Matrices, Part, Place, Storage, storages};
 
 pub use peak::{copy, matrix_products, multiply_adds};
 
 use layout::Layout;
 use raygrad_compiler::graph::Shape;
 use raygrad_compiler::plan::Program;
+use std::ops::Range;
 
 /// A buffer that a kernel binds, at its position in the list.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Binding {
     pub arena: ArenaId,
     pub writable: bool,
+}
+
+/// Lanes that a kernel may read or write.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Access {
+    pub arena: ArenaId,
+    pub lanes: Range<u64>,
+    pub write: bool,
+}
+
+impl Access {
+    /// Whether the order of the two matters.
+    fn conflicts(&self, other: &Access) -> bool {
+        let overlap = self.lanes.start < other.lanes.end && other.lanes.start < self.lanes.end;
+        self.arena == other.arena && overlap && (self.write || other.write)
+    }
+}
+
+/// The numbers of kernels in groups, one after the other: kernels of a group do not wait for each other, and each is in the
+/// first group after all that it has to wait for.
+pub fn groups(kernels: &[Kernel]) -> Vec<Vec<usize>> {
+    let waits = |a: &Kernel, b: &Kernel| a.accesses.iter().any(|x| b.accesses.iter().any(|y| x.conflicts(y)));
+    let mut level: Vec<usize> = vec![];
+    let mut groups: Vec<Vec<usize>> = vec![];
+    for (i, kernel) in kernels.iter().enumerate() {
+        let own = (0..i).filter(|j| waits(&kernels[*j], kernel)).map(|j| level[j] + 1).max().unwrap_or(0);
+        level.push(own);
+        if groups.len() == own {
+            groups.push(vec![]);
+        }
+        groups[own].push(i);
+    }
+    groups
 }
 
 /// One dispatch.
@@ -53,6 +87,7 @@ pub struct Kernel {
     pub info: naga::valid::ModuleInfo,
     /// Bindings of group 0, in order.
     pub bindings: Vec<Binding>,
+    pub accesses: Vec<Access>,
     pub workgroups: [u32; 3],
     pub workgroup_size: u32,
 }

@@ -3,7 +3,7 @@
 use super::builder::{Builder, Factor, Kind, MatrixAt, Value};
 use super::layout::{Arena, ArenaId, Half, Matrices, Storage};
 use super::memory::validated;
-use super::{Binding, GpuLaunch, GpuProgram, Kernel, LowerError};
+use super::{Access, Binding, GpuLaunch, GpuProgram, Kernel, LowerError};
 use naga::BuiltIn;
 
 const INVOCATIONS: u32 = 256;
@@ -152,7 +152,17 @@ fn program(b: Builder, half: Option<Half>, workgroups: u32, buffers: &[(&str, u6
     let (module, info) = validated(b.finish(), half, "peak")?;
     let bindings = (0..buffers.len()).map(|i| Binding { arena: ArenaId::Own(i), writable: i == 0 }).collect();
     let workgroup_size = INVOCATIONS;
-    let kernel = Kernel { name: "peak".into(), module, info, bindings, workgroups: [workgroups, 1, 1], workgroup_size };
+    let access = |i: usize, lanes| Access { arena: ArenaId::Own(i), lanes: 0..lanes, write: i == 0 };
+    let accesses = buffers.iter().enumerate().map(|(i, b)| access(i, b.1)).collect();
+    let kernel = Kernel {
+        name: "peak".into(),
+        module,
+        info,
+        bindings,
+        accesses,
+        workgroups: [workgroups, 1, 1],
+        workgroup_size,
+    };
     let arena = |(name, lanes): &(&str, u64)| Arena { name: name.to_string(), storage: Storage::F32, lanes: *lanes };
     Ok(GpuProgram {
         launches: vec![GpuLaunch { name: "peak".into(), kernels: vec![kernel] }],

@@ -6,7 +6,7 @@ use super::queue::barrier;
 use crate::RunError;
 use crate::gpu::bound;
 use ash::vk;
-use raygrad_kernels::gpu::{GpuLaunch, Kernel};
+use raygrad_kernels::gpu::{GpuLaunch, Kernel, groups};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -32,6 +32,8 @@ pub(crate) struct Loaded {
     dispatches: Vec<Dispatch>,
     /// Those of every launch.
     launches: Vec<Range<usize>>,
+    /// The same dispatches in groups that do not wait for each other.
+    groups: Vec<Vec<usize>>,
     descriptors: vk::DescriptorPool,
     pool: vk::CommandPool,
     gpu: Arc<Gpu>,
@@ -50,6 +52,7 @@ impl Loaded {
             layouts: BTreeMap::new(),
             dispatches: vec![],
             launches: vec![],
+            groups: vec![],
             descriptors: vk::DescriptorPool::null(),
             pool: vk::CommandPool::null(),
             gpu: gpu.clone(),
@@ -79,6 +82,7 @@ impl Loaded {
         if let Some(e) = failed {
             return Err(e);
         }
+        loaded.groups = groups(&kernels);
         loaded.bind(&kernels, inputs, own)?;
         let description = vk::CommandPoolCreateInfo::default().queue_family_index(gpu.family);
         // SAFETY: a handle of this device.
@@ -180,8 +184,8 @@ impl Loaded {
         }
     }
 
-    /// A new command buffer with all dispatches, each after the one before it; the clock is read at the start and after
-    /// every launch.
+    /// A new command buffer with all dispatches. If the clock is read, at the start and after every launch, each waits for the
+    /// one before it; else those of a group are free to run together.
     fn record(&self, clock: Option<vk::QueryPool>) -> Result<vk::CommandBuffer, RunError> {
         let gpu = &self.gpu;
         // SAFETY: handles of this device; the queries are as many as launches and one more.
@@ -205,18 +209,27 @@ impl Loaded {
                 gpu.device.cmd_reset_query_pool(commands, queries, 0, self.launches.len() as u32 + 1);
             }
             let compute = vk::PipelineBindPoint::COMPUTE;
+            let run = |dispatch: &Dispatch| {
+                gpu.device.cmd_bind_pipeline(commands, compute, dispatch.pipeline);
+                gpu.device.cmd_bind_descriptor_sets(commands, compute, dispatch.layout, 0, &[dispatch.set], &[]);
+                let [x, y, z] = dispatch.workgroups;
+                gpu.device.cmd_dispatch(commands, x, y, z);
+            };
             barrier(gpu, commands);
-            read_clock(0);
-            for (i, launch) in self.launches.iter().enumerate() {
-                for dispatch in &self.dispatches[launch.clone()] {
-                    gpu.device.cmd_bind_pipeline(commands, compute, dispatch.pipeline);
-                    let sets = [dispatch.set];
-                    gpu.device.cmd_bind_descriptor_sets(commands, compute, dispatch.layout, 0, &sets, &[]);
-                    let [x, y, z] = dispatch.workgroups;
-                    gpu.device.cmd_dispatch(commands, x, y, z);
+            if clock.is_some() {
+                read_clock(0);
+                for (i, launch) in self.launches.iter().enumerate() {
+                    for dispatch in &self.dispatches[launch.clone()] {
+                        run(dispatch);
+                        barrier(gpu, commands);
+                    }
+                    read_clock(i + 1);
+                }
+            } else {
+                for group in &self.groups {
+                    group.iter().for_each(|d| run(&self.dispatches[*d]));
                     barrier(gpu, commands);
                 }
-                read_clock(i + 1);
             }
             gpu.device.end_command_buffer(commands).map_err(|e| gpu.error(e))?;
             Ok(commands)

@@ -117,8 +117,9 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
     let peak_rss_mb = peak_rss_mb();
     let peak_gbytes = if args.launches { Some(device.peak_gbytes()?) } else { None };
     let program = trainer.learner().program(trainer.training_program());
+    let of_lanes = device.lane_bytes(program);
     if let Some(file) = &args.trace {
-        write_trace(file, program, &profiled)?;
+        write_trace(file, program, &of_lanes, &profiled)?;
     }
     let seconds = median(&mut times);
     let gflop = trainer.flops() / 1e9;
@@ -137,7 +138,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
         peak_rss_mb,
         host_seconds_per_step: host,
         peak_gbytes,
-        per_launch: if args.launches { launches(program, &profiled) } else { vec![] },
+        per_launch: if args.launches { launches(program, &of_lanes, &profiled) } else { vec![] },
     };
     if args.json {
         print(&format!("{}\n", serde_json::to_string(&result)?))?;
@@ -194,12 +195,12 @@ fn profile(trainer: &mut dyn Training) -> anyhow::Result<Vec<Vec<f64>>> {
     Ok(steps)
 }
 
-fn launches(program: &Program, profiled: &[Vec<f64>]) -> Vec<Launch> {
+fn launches(program: &Program, of_lanes: &[u64], profiled: &[Vec<f64>]) -> Vec<Launch> {
     let one = |(i, launch): (usize, &raygrad_compiler::plan::Launch)| Launch {
         name: launch.name.clone(),
         seconds: median(&mut profiled.iter().map(|step| step[i]).collect::<Vec<_>>()),
         gflop: launch.region.flops() as f64 * 1e-9,
-        gbytes: program.launch_bytes(i) as f64 * 1e-9,
+        gbytes: program.launch_bytes_of(i, |b| of_lanes[b.0 as usize]) as f64 * 1e-9,
     };
     program.launches.iter().enumerate().map(one).collect()
 }
@@ -234,7 +235,7 @@ fn write_launches(text: &mut String, launches: &[Launch], peak: f64, peak_gbytes
 }
 
 /// Complete events of the trace event format (times in microseconds), the steps one after the other.
-fn write_trace(file: &Path, program: &Program, profiled: &[Vec<f64>]) -> anyhow::Result<()> {
+fn write_trace(file: &Path, program: &Program, of_lanes: &[u64], profiled: &[Vec<f64>]) -> anyhow::Result<()> {
     let mut events = vec![];
     let mut at = 0.0;
     for (number, step) in profiled.iter().enumerate() {
@@ -243,7 +244,7 @@ fn write_trace(file: &Path, program: &Program, profiled: &[Vec<f64>]) -> anyhow:
         events.push(json!({ "name": name, "ph": "X", "pid": 1, "tid": 1, "ts": at * 1e6, "dur": length * 1e6 }));
         for (i, (launch, seconds)) in program.launches.iter().zip(step).enumerate() {
             let megaflop = launch.region.flops() as f64 * 1e-6;
-            let megabytes = program.launch_bytes(i) as f64 * 1e-6;
+            let megabytes = program.launch_bytes_of(i, |b| of_lanes[b.0 as usize]) as f64 * 1e-6;
             events.push(json!({
                 "name": launch.name, "ph": "X", "pid": 1, "tid": 1, "ts": at * 1e6, "dur": seconds * 1e6,
                 "args": { "MFLOP": megaflop, "MB": megabytes },
