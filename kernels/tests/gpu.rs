@@ -2,10 +2,13 @@
 #![cfg(feature = "gpu")]
 
 use raygrad_compiler::autodiff::grad;
-use raygrad_compiler::graph::Tensor;
+use raygrad_compiler::graph::{Axis, Shape, Tensor};
+use raygrad_compiler::ops::pick::concat;
 use raygrad_compiler::ops::registry;
+use raygrad_compiler::plan::{BufferKind, Program};
+use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Step, Target, compile};
-use raygrad_kernels::gpu::{Inputs, Kernel, Limits, lower};
+use raygrad_kernels::gpu::{Access, Half, Inputs, Kernel, Limits, Matrices, Storage, groups, lower, storages};
 use raygrad_tests::MidGraph;
 use std::io::Write;
 use std::process::{Command, Stdio};
@@ -18,7 +21,11 @@ fn kernels(graph: &MidGraph, name: &str) -> Vec<Kernel> {
     outputs.extend(gradients.into_iter().enumerate().map(|(i, g)| (format!("gradient {i}"), g)));
     let step = Step { outputs, updates: vec![] };
     let program = compile(&step, &Target::gpu()).unwrap_or_else(|e| panic!("{name}: {e}"));
-    let lowered = lower(&program, &mut Inputs::default(), &Limits::default());
+    lowered(&program, &Limits::default(), name)
+}
+
+fn lowered(program: &Program, limits: &Limits, name: &str) -> Vec<Kernel> {
+    let lowered = lower(program, &mut Inputs::default(), limits);
     let lowered = lowered.unwrap_or_else(|e| panic!("{name}: {e}\n{program}"));
     lowered.launches.into_iter().flat_map(|l| l.kernels).collect()
 }
@@ -29,6 +36,85 @@ fn each(f: impl Fn(&str, &Kernel)) {
             f(&sample.name, &kernel);
         }
     }
+}
+
+/// A network's step, wide enough for every kind of matrix product.
+fn network() -> Program {
+    let row = Axis::new("row", 40_000);
+    let x = Tensor::data("x", Shape::new(&[&row], 63));
+    let weight = |name: &str, rows: usize, columns: usize| Tensor::parameter(name, Shape::new(&[], (rows, columns)));
+    let all = [weight("a", 63, 256), weight("b", 319, 128), weight("c", 128, 3)];
+    let hidden = x.linear(&all[0]).relu();
+    let y = concat([&hidden, &x]).linear(&all[1]).relu().linear(&all[2]);
+    let loss = (&y * &y).sum_channels().sum(&[&row]);
+    let gradients = grad(&loss, &all.iter().collect::<Vec<_>>());
+    let outputs = ["a", "b", "c"].iter().map(|n| n.to_string()).zip(gradients).collect();
+    compile(&Step { outputs, updates: vec![] }, &Target::gpu()).unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// What devices have for half precision: storing it, and matrices as large as NVIDIA's and as small as a software driver's.
+fn halves() -> [Half; 3] {
+    let matrices = |side, subgroup| Half { matrices: Some(Matrices { side, subgroup }) };
+    [Half { matrices: None }, matrices(16, 32), matrices(8, 8)]
+}
+
+#[test]
+fn kernels_in_half_precision_keep_to_the_limits() {
+    let program = network();
+    for half in halves() {
+        for max_workgroup_bytes in [16 << 10, 32 << 10, 48 << 10] {
+            let limits = Limits { half: Some(half), max_workgroup_bytes, ..Limits::default() };
+            let kernels = lowered(&program, &limits, "network");
+            let mut multiply = 0;
+            for kernel in &kernels {
+                let what = format!("{half:?}, {}", kernel.name);
+                let wgsl = kernel.wgsl().unwrap_or_else(|e| panic!("{what}: {e}"));
+                assert!(kernel.spirv().is_ok_and(|words| words.len() > 5), "{what}");
+                assert!(kernel.workgroup_size <= 256, "{what}");
+                multiply += usize::from(wgsl.contains("coopMultiplyAdd"));
+                // The smallest tile of matrices needs 24 KiB.
+                let most =
+                    if half.matrices.is_some() { max_workgroup_bytes.max(24 << 10) } else { max_workgroup_bytes };
+                assert!(kernel.workgroup_bytes() <= most, "{what}: {} bytes", kernel.workgroup_bytes());
+            }
+            // Two layers forwards, one of them backwards, and two gradients of weights.
+            assert_eq!(multiply, if half.matrices.is_some() { 5 } else { 0 }, "{half:?}");
+        }
+    }
+}
+
+/// What lies between launches is stored as halves where a product reads it, and nothing else is.
+#[test]
+fn halves_are_what_products_read() {
+    let program = network();
+    let limits = Limits { half: Some(halves()[0]), ..Limits::default() };
+    for (buffer, storage) in program.buffers.iter().zip(storages(&program, &limits)) {
+        let wide = buffer.shape.channels.count() >= 16 && buffer.shape.dtype == DType::F32;
+        let half = matches!(buffer.kind, BufferKind::Temporary { .. }) && wide;
+        assert_eq!(storage == Storage::F16, half, "{}: {storage:?}", buffer.label);
+    }
+    assert!(storages(&program, &Limits::default()).iter().all(|s| *s != Storage::F16));
+}
+
+#[test]
+fn groups_keep_the_order_of_kernels_that_conflict() {
+    let kernels = lowered(&network(), &Limits::default(), "network");
+    let groups = groups(&kernels);
+    let group_of = |kernel: usize| groups.iter().position(|g| g.contains(&kernel)).expect("every kernel has a group");
+    let mut together = false;
+    for (later, b) in kernels.iter().enumerate() {
+        for (earlier, a) in kernels[..later].iter().enumerate() {
+            let clash = |x: &Access, y: &Access| {
+                let overlap = x.lanes.start.max(y.lanes.start) < x.lanes.end.min(y.lanes.end);
+                x.arena == y.arena && overlap && (x.write || y.write)
+            };
+            let conflict = a.accesses.iter().any(|x| b.accesses.iter().any(|y| clash(x, y)));
+            assert!(!conflict || group_of(earlier) < group_of(later), "{} and {}", a.name, b.name);
+            together |= group_of(earlier) == group_of(later);
+        }
+    }
+    assert_eq!(groups.iter().map(Vec::len).sum::<usize>(), kernels.len());
+    assert!(together, "a weight gradient and the gradient before it need not wait for each other");
 }
 
 #[test]

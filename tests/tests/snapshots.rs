@@ -63,15 +63,20 @@ fn plans_do_not_depend_on_what_was_recorded_before() {
 #[cfg(feature = "gpu")]
 mod wgsl {
     use super::{Planar, snapshot};
+    use raygrad_compiler::autodiff::grad;
+    use raygrad_compiler::graph::{Axis, Shape, Tensor};
     use raygrad_compiler::{Step, Target, compile};
-    use raygrad_kernels::gpu::{Inputs, Limits, lower};
+    use raygrad_kernels::gpu::{Half, Inputs, Limits, Matrices, lower};
     use raygrad_tests::forms::forms;
 
     /// Every kernel of a step.
     fn kernels(step: &Step) -> String {
+        kernels_within(step, &Limits { max_binding: u64::MAX, ..Limits::default() })
+    }
+
+    fn kernels_within(step: &Step, limits: &Limits) -> String {
         let program = compile(step, &Target::gpu()).unwrap_or_else(|e| panic!("{e}"));
-        let lowered = lower(&program, &mut Inputs::default(), &Limits { max_binding: u64::MAX, ..Limits::default() })
-            .unwrap_or_else(|e| panic!("{e}"));
+        let lowered = lower(&program, &mut Inputs::default(), limits).unwrap_or_else(|e| panic!("{e}"));
         let kernels = lowered.launches.iter().flat_map(|l| &l.kernels);
         let text = kernels.map(|k| {
             let wgsl = k.wgsl().unwrap_or_else(|e| panic!("{e}"));
@@ -84,6 +89,21 @@ mod wgsl {
     fn kernels_of_every_form() {
         for (name, step) in forms() {
             snapshot(&format!("wgsl-{name}"), &kernels(&step));
+        }
+    }
+
+    /// A layer and what follows from it in half precision, without cooperative matrices and with them.
+    #[test]
+    fn kernels_of_halves() {
+        let row = Axis::new("row", 1200);
+        let x = Tensor::data("x", Shape::new(&[&row], 40));
+        let w = Tensor::parameter("w", Shape::new(&[], (40, 70)));
+        let y = (x.linear(&w) + Tensor::parameter("b", Shape::new(&[], 70))).relu();
+        let loss = (&y * &y).sum_channels().sum(&[&row]);
+        let step = Step { outputs: vec![("dw".into(), grad(&loss, &[&w]).remove(0))], updates: vec![] };
+        for (name, matrices) in [("halves", None), ("matrices", Some(Matrices { side: 16, subgroup: 32 }))] {
+            let limits = Limits { half: Some(Half { matrices }), max_workgroup_bytes: 48 << 10, ..Limits::default() };
+            snapshot(&format!("wgsl-{name}"), &kernels_within(&step, &limits));
         }
     }
 

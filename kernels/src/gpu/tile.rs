@@ -100,10 +100,9 @@ impl Tile {
 pub(super) fn split(columns: usize) -> Vec<std::ops::Range<usize>> {
     const FEW: usize = 16;
     let rest = columns % 64;
-    match columns > 64 && (1..=FEW).contains(&rest) {
-        true => vec![0..columns - rest, columns - rest..columns],
-        false => vec![0..columns],
-    }
+    let few = columns > 64 && (1..=FEW).contains(&rest);
+    let end = if few { columns - rest } else { columns };
+    [0..end, end..columns].into_iter().filter(|r| !r.is_empty()).collect()
 }
 
 /// A direction through an operand.

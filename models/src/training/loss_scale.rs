@@ -81,3 +81,79 @@ impl LossScale {
         vec![(self.held, next), (self.steps, steps)]
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Precision;
+    use crate::training::optimise::{Rates, updates};
+    use raygrad_compiler::functions::mlp::{Init, Parameter};
+    use raygrad_compiler::{Step, compile};
+    use raygrad_runtime::{Device, ProgramId, Session};
+
+    const LANES: usize = 5000;
+
+    /// A step of `loss = sum factor p`, whose gradient is the factor.
+    fn session() -> (Session, ProgramId) {
+        let p = Tensor::parameter("p", Shape::new(&[], LANES));
+        let factor = Tensor::data("factor", Shape::new(&[], LANES));
+        let loss = (&p * factor).sum_channels();
+        let parameter = Parameter { tensor: p, init: Init::Zero, trained: true };
+        let updates = updates(&loss, &[parameter], &[], Precision::Mixed);
+        let device = Device::cpu(Some(1)).unwrap();
+        let mut session = Session::new(device.clone()).unwrap();
+        let program = compile(&Step { outputs: vec![], updates }, &device.target()).unwrap();
+        let program = session.add(program).unwrap();
+        let optim = crate::config::Layered::load("planar-l2g").unwrap().settings.optim;
+        for (name, value) in Rates::at(&optim, 0).inputs() {
+            if session.inputs().any(|(n, _)| n == name) {
+                session.set(name, &[value as f32]).unwrap();
+            }
+        }
+        (session, program)
+    }
+
+    #[test]
+    fn a_gradient_that_is_not_finite_changes_nothing_but_the_scale() {
+        let (mut session, program) = session();
+        let mut factor = vec![1e-3; LANES];
+        session.set("factor", &factor).unwrap();
+        session.run(program).unwrap();
+        let before = ["p", "adam.m.p", "adam.v.p"].map(|n| session.get(n).unwrap());
+        assert!(before.iter().all(|v| v.iter().all(|x| *x != 0.0 && x.is_finite())));
+        // The moments are those of the gradient itself, not of the scaled one.
+        assert!((before[1][7] - 1e-4).abs() < 1e-9, "{}", before[1][7]);
+        assert_eq!(session.get("loss_scale").unwrap(), [START as f32]);
+        assert_eq!(session.get("loss_scale.steps").unwrap(), [1.0]);
+        for (bad, scale) in [(f32::INFINITY, START / 2.0), (f32::NAN, START / 4.0), (1e38, START / 8.0)] {
+            factor[LANES - 3] = bad;
+            session.set("factor", &factor).unwrap();
+            session.run(program).unwrap();
+            let after = ["p", "adam.m.p", "adam.v.p"].map(|n| session.get(n).unwrap());
+            assert!(after == before, "{bad}");
+            assert_eq!(session.get("loss_scale").unwrap(), [scale as f32], "{bad}");
+            assert_eq!(session.get("loss_scale.steps").unwrap(), [0.0], "{bad}");
+        }
+        factor[LANES - 3] = 1e-3;
+        session.set("factor", &factor).unwrap();
+        session.run(program).unwrap();
+        assert!(session.get("p").unwrap().iter().zip(&before[0]).all(|(a, b)| a != b));
+    }
+
+    #[test]
+    fn the_scale_grows_after_patience() {
+        let (mut session, program) = session();
+        session.set("factor", &vec![1e-3; LANES]).unwrap();
+        for (steps, scale) in [(PATIENCE - 2.0, START), (PATIENCE - 1.0, 2.0 * START)] {
+            session.set("loss_scale", &[START as f32]).unwrap();
+            session.set("loss_scale.steps", &[steps as f32]).unwrap();
+            session.run(program).unwrap();
+            assert_eq!(session.get("loss_scale").unwrap(), [scale as f32]);
+        }
+        assert_eq!(session.get("loss_scale.steps").unwrap(), [0.0]);
+        session.set("loss_scale", &[MOST as f32]).unwrap();
+        session.set("loss_scale.steps", &[PATIENCE as f32]).unwrap();
+        session.run(program).unwrap();
+        assert_eq!(session.get("loss_scale").unwrap(), [MOST as f32]);
+    }
+}

@@ -98,6 +98,14 @@ fn invertible_warps_that_do_not_fit() {
 #[test]
 fn a_device_that_is_not_there() {
     let w = Workplace::new();
+    mentions(
+        &w.refuse(&["train", "tiny.toml", "--device", "cpu", "--precision", "mixed", "--out", "run"]),
+        &["CPU", "no half precision", "--precision f32"],
+    );
+    mentions(
+        &w.refuse(&["train", "tiny.toml", "--precision", "double", "--out", "run"]),
+        &["--precision", "run.precision", "`f32` or `mixed`"],
+    );
     mentions(&w.refuse(&["train", "tiny.toml", "--device", "wgpu:99", "--out", "run"]), &["error:"]);
     mentions(&w.refuse(&["train", "tiny.toml", "--device", "vulkan:99", "--out", "run"]), &["error:"]);
     mentions(
