@@ -1,6 +1,6 @@
 //! Devices: what programs run on.
 
-use crate::DeviceError;
+use crate::{DeviceError, RunError};
 use raygrad_compiler::{Program, Target};
 use raygrad_kernels::cpu::Isa;
 #[cfg(feature = "gpu")]
@@ -14,10 +14,20 @@ pub enum Device {
     Cpu { pool: Arc<rayon::ThreadPool> },
     /// A GPU, or software that acts as one.
     #[cfg(feature = "wgpu")]
-    Wgpu { gpu: Arc<crate::wgpu::Gpu>, half: Option<Half> },
+    Wgpu { gpu: Arc<crate::wgpu::Gpu>, forms: Forms },
     /// The same through Vulkan, with a device of raygrad's own.
     #[cfg(feature = "vulkan")]
-    Vulkan { gpu: Arc<crate::vulkan::Gpu>, half: Option<Half> },
+    Vulkan { gpu: Arc<crate::vulkan::Gpu>, forms: Forms },
+}
+
+/// Which forms of kernels a device runs, where there is a choice.
+#[cfg(feature = "gpu")]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Forms {
+    /// What kernels use for half precision; `None` at single precision.
+    pub half: Option<Half>,
+    /// How many of the largest tiles not to use ([`Limits::tiles`]).
+    pub tiles: u32,
 }
 
 /// How precise a device computes.
@@ -46,13 +56,14 @@ impl Device {
     pub fn auto(threads: Option<usize>) -> Result<Device, DeviceError> {
         #[cfg(feature = "gpu")]
         if may_have_gpu() {
-            #[cfg(feature = "wgpu")]
-            if let Some(gpu) = crate::wgpu::Gpu::auto() {
-                return Ok(Device::Wgpu { gpu: Arc::new(gpu), half: None });
-            }
+            // Where both drive an adapter, Vulkan was measured to be faster.
             #[cfg(feature = "vulkan")]
             if let Some(gpu) = crate::vulkan::Gpu::auto() {
-                return Ok(Device::Vulkan { gpu: Arc::new(gpu), half: None });
+                return Ok(Device::Vulkan { gpu: Arc::new(gpu), forms: Forms::default() });
+            }
+            #[cfg(feature = "wgpu")]
+            if let Some(gpu) = crate::wgpu::Gpu::auto() {
+                return Ok(Device::Wgpu { gpu: Arc::new(gpu), forms: Forms::default() });
             }
         }
         Device::cpu(threads)
@@ -61,7 +72,7 @@ impl Device {
     /// The adapter numbered `index` in [`Device::list`], or the best one, software included.
     #[cfg(feature = "wgpu")]
     pub fn wgpu(index: Option<usize>) -> Result<Device, DeviceError> {
-        Ok(Device::Wgpu { gpu: Arc::new(crate::wgpu::Gpu::open(index)?), half: None })
+        Ok(Device::Wgpu { gpu: Arc::new(crate::wgpu::Gpu::open(index)?), forms: Forms::default() })
     }
 
     /// This build has no wgpu backend.
@@ -73,7 +84,7 @@ impl Device {
     /// The Vulkan driver numbered `index` in [`Device::list`], or the best one, software included.
     #[cfg(feature = "vulkan")]
     pub fn vulkan(index: Option<usize>) -> Result<Device, DeviceError> {
-        Ok(Device::Vulkan { gpu: Arc::new(crate::vulkan::Gpu::open(index)?), half: None })
+        Ok(Device::Vulkan { gpu: Arc::new(crate::vulkan::Gpu::open(index)?), forms: Forms::default() })
     }
 
     /// This build has no Vulkan backend.
@@ -120,33 +131,58 @@ impl Device {
         match self {
             Device::Cpu { .. } => None,
             #[cfg(feature = "wgpu")]
-            Device::Wgpu { gpu, .. } => gpu.half(),
+            Device::Wgpu { gpu, .. } => gpu.adapter().half,
             #[cfg(feature = "vulkan")]
-            Device::Vulkan { gpu, .. } => gpu.half(),
+            Device::Vulkan { gpu, .. } => gpu.adapter().half,
         }
     }
 
     /// The same device with what kernels may use for half precision.
     #[cfg(feature = "gpu")]
     pub fn with_half(self, half: Option<Half>) -> Device {
-        match self {
-            Device::Cpu { .. } => self,
-            #[cfg(feature = "wgpu")]
-            Device::Wgpu { gpu, .. } => Device::Wgpu { gpu, half },
-            #[cfg(feature = "vulkan")]
-            Device::Vulkan { gpu, .. } => Device::Vulkan { gpu, half },
-        }
+        let forms = Forms { half, ..self.forms() };
+        self.with_forms(forms)
     }
 
     /// What kernels use for half precision; `None` at single precision.
     #[cfg(feature = "gpu")]
     pub fn half(&self) -> Option<Half> {
+        self.forms().half
+    }
+
+    /// The same device with other forms of kernels.
+    #[cfg(feature = "gpu")]
+    pub fn with_forms(self, forms: Forms) -> Device {
         match self {
-            Device::Cpu { .. } => None,
+            Device::Cpu { .. } => self,
             #[cfg(feature = "wgpu")]
-            Device::Wgpu { half, .. } => *half,
+            Device::Wgpu { gpu, .. } => Device::Wgpu { gpu, forms },
             #[cfg(feature = "vulkan")]
-            Device::Vulkan { half, .. } => *half,
+            Device::Vulkan { gpu, .. } => Device::Vulkan { gpu, forms },
+        }
+    }
+
+    #[cfg(feature = "gpu")]
+    pub fn forms(&self) -> Forms {
+        match self {
+            Device::Cpu { .. } => Forms::default(),
+            #[cfg(feature = "wgpu")]
+            Device::Wgpu { forms, .. } => *forms,
+            #[cfg(feature = "vulkan")]
+            Device::Vulkan { forms, .. } => *forms,
+        }
+    }
+
+    /// The same device with the tiles that run a program fastest: found by running it with each choice, or known from before
+    /// (results are kept on disk, by program, device, driver and precision). On the CPU there is nothing to choose.
+    ///
+    /// Other tiles add up in another order: results differ by rounding.
+    #[cfg_attr(not(feature = "gpu"), expect(unused_variables))]
+    pub fn tuned(self, program: &Program) -> Result<Device, RunError> {
+        match self {
+            Device::Cpu { .. } => Ok(self),
+            #[cfg(feature = "gpu")]
+            _ => crate::gpu::tune::tuned(self, program),
         }
     }
 
@@ -208,7 +244,7 @@ fn listed(backend: &str, adapters: Vec<crate::gpu::Adapter>) -> impl Iterator<It
         id: format!("{backend}:{i}"),
         name: a.name,
         backend: a.api,
-        details: format!("{}, {}", a.kind, a.driver),
+        details: format!("{}, {}{}", a.kind, a.driver, a.half.map_or(String::new(), |h| format!(", {h}"))),
     })
 }
 

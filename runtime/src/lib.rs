@@ -16,6 +16,8 @@ pub mod vulkan;
 #[cfg(feature = "wgpu")]
 pub mod wgpu;
 
+#[cfg(feature = "gpu")]
+pub use device::Forms;
 pub use device::{Device, DeviceInfo, Precision};
 pub use error::{DeviceError, RunError};
 #[cfg(feature = "gpu")]

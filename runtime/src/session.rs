@@ -52,9 +52,9 @@ impl Session {
         let executor: Box<dyn Executor> = match device {
             Device::Cpu { pool } => Box::new(CpuExecutor::new(pool)),
             #[cfg(feature = "wgpu")]
-            Device::Wgpu { gpu, half } => Box::new(GpuExecutor::new(crate::wgpu::WgpuApi::new(gpu), half)),
+            Device::Wgpu { gpu, forms } => Box::new(GpuExecutor::new(crate::wgpu::WgpuApi::new(gpu), forms)),
             #[cfg(feature = "vulkan")]
-            Device::Vulkan { gpu, half } => Box::new(GpuExecutor::new(crate::vulkan::VulkanApi::new(gpu)?, half)),
+            Device::Vulkan { gpu, forms } => Box::new(GpuExecutor::new(crate::vulkan::VulkanApi::new(gpu)?, forms)),
         };
         Ok(Session { executor, programs: vec![], inputs: BTreeMap::new() })
     }

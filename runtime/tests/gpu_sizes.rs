@@ -9,7 +9,7 @@ use raygrad_compiler::reference::{Array, Bindings, evaluate};
 use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Step, compile};
 use raygrad_kernels::gpu::Half;
-use raygrad_runtime::{Device, Precision, ProgramId, Session};
+use raygrad_runtime::{Device, Forms, Precision, ProgramId, Session};
 use raygrad_tests::backend::compare;
 use raygrad_tests::{Rng, seed, total};
 
@@ -311,12 +311,12 @@ fn narrow(device: &Device) -> Device {
         #[cfg(feature = "wgpu")]
         Device::Wgpu { .. } => {
             let gpu = raygrad_runtime::wgpu::Gpu::open(None).unwrap().with_max_binding(limit);
-            Device::Wgpu { gpu: gpu.into(), half: None }
+            Device::Wgpu { gpu: gpu.into(), forms: Forms::default() }
         }
         #[cfg(feature = "vulkan")]
         Device::Vulkan { .. } => {
             let gpu = raygrad_runtime::vulkan::Gpu::open(None).unwrap().with_max_binding(limit);
-            Device::Vulkan { gpu: gpu.into(), half: None }
+            Device::Vulkan { gpu: gpu.into(), forms: Forms::default() }
         }
     }
 }

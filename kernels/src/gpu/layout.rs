@@ -11,6 +11,7 @@ use raygrad_compiler::plan::region::{BufferId, Inst, InstId, Region, RegionOp, S
 use raygrad_compiler::plan::{BufferKind, Program};
 use raygrad_compiler::scalar::DType;
 use std::collections::BTreeMap;
+use std::fmt;
 use std::ops::Range;
 
 /// Buffers start at multiples of this many lanes: 256 bytes, which suits every device's copies and cache lines.
@@ -27,15 +28,30 @@ pub struct Limits {
     pub max_workgroups: u32,
     /// Memory that a workgroup may share.
     pub max_workgroup_bytes: u32,
+    /// How many of the largest tiles of matrix products not to use, which would otherwise be preferred: what is fastest
+    /// depends on the device. [`TILES`] are there to choose from.
+    pub tiles: u32,
     /// Mixed precision: what matrix products read is stored in half precision, and sums stay in single. `None`: all is
     /// single.
     pub half: Option<Half>,
 }
 
+/// Choices of [`Limits::tiles`].
+pub const TILES: u32 = 3;
+
 /// What a device has for half precision, beside storing it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Half {
     pub matrices: Option<Matrices>,
+}
+
+impl fmt::Display for Half {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        match self.matrices {
+            Some(Matrices { side, .. }) => write!(f, "matrices of {side} x {side} halves"),
+            None => f.write_str("halves"),
+        }
+    }
 }
 
 /// Cooperative matrices of `side x side` that a subgroup multiplies: halves, summed in single precision.
@@ -80,6 +96,7 @@ impl Default for Limits {
             max_buffers: 8,
             max_workgroups: 65535,
             max_workgroup_bytes: 16 << 10,
+            tiles: 0,
             half: None,
         }
     }

@@ -29,7 +29,7 @@ mod scatter;
 mod stages;
 mod tile;
 
-pub use layout::{Arena, ArenaId, Half, Inputs, Limits, Matrices, Part, Place, Storage, storages};
+pub use layout::{Arena, ArenaId, Half, Inputs, Limits, Matrices, Part, Place, Storage, TILES, storages};
 
 pub use peak::{copy, matrix_products, multiply_adds};
 

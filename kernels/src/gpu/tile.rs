@@ -36,6 +36,7 @@ impl Tile {
             let workgroups = m.div_ceil(t.m as usize) as u64 * n.div_ceil(t.n as usize) as u64 * products as u64;
             workgroups >= ENOUGH && t.bytes() <= limits.max_workgroup_bytes
         };
+        let skipped = limits.tiles as usize;
         if let Some(matrices) = limits.half.and_then(|h| h.matrices)
             && n > 32
             && k >= 16
@@ -52,7 +53,7 @@ impl Tile {
                 // All columns at once: the other operand is then read once.
                 _ => vec![tile(128, 256, (4, 4)), tile(64, 128, (2, 4))],
             };
-            return all.into_iter().find(fits).unwrap_or(tile(64, 64, (2, 2)));
+            return all.into_iter().skip(skipped).find(fits).unwrap_or(tile(64, 64, (2, 2)));
         }
         let deep = match k {
             0..=4 => 4,
@@ -70,7 +71,8 @@ impl Tile {
             _ => {
                 // Long sums write little.
                 let largest = if k >= LONG { tile(128, 128, deep, 8, 8) } else { tile(128, 64, deep.min(8), 8, 8) };
-                [largest, tile(64, 64, deep, 8, 8)].into_iter().find(fits).unwrap_or(tile(32, 32, deep, 4, 4))
+                let all = [largest, tile(64, 64, deep, 8, 8)];
+                all.into_iter().skip(skipped).find(fits).unwrap_or(tile(32, 32, deep, 4, 4))
             }
         }
     }

@@ -223,6 +223,8 @@ pub struct Run {
     pub threads: Count,
     #[serde(default)]
     pub precision: Precision,
+    #[serde(default)]
+    pub autotune: bool,
     pub log_every: usize,
     pub picture_every: usize,
     pub checkpoint_every: usize,

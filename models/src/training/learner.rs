@@ -2,7 +2,7 @@
 
 use super::optimise::{Rates, STEP};
 use crate::Error;
-use crate::config::Optim;
+use crate::config::{Optim, Settings};
 use crate::data::initial_values;
 use crate::run::checkpoint::{Checkpoint, Saved};
 use raygrad_compiler::functions::mlp::Parameter;
@@ -174,6 +174,14 @@ impl Learner {
     /// The device, for people.
     pub fn device_name(&self) -> String {
         self.device.name()
+    }
+}
+
+/// The device for a training step: with `run.autotune`, the tiles that run it fastest.
+pub fn device_for(step: &Step, settings: &Settings, device: Device) -> Result<Device, Error> {
+    match settings.run.autotune {
+        true => Ok(device.clone().tuned(&compile(step, &device.target())?)?),
+        false => Ok(device),
     }
 }
 

@@ -24,7 +24,7 @@ impl CacheFile {
         CacheFile::at(path)
     }
 
-    fn at(path: Option<PathBuf>) -> (CacheFile, Vec<u8>) {
+    pub(super) fn at(path: Option<PathBuf>) -> (CacheFile, Vec<u8>) {
         let mut bytes = path.as_ref().and_then(|f| std::fs::read(f).ok()).unwrap_or_default();
         if bytes.len() < HASH || bytes.len() > MOST {
             return (CacheFile { path, known: None }, vec![]);

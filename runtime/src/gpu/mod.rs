@@ -4,7 +4,9 @@
 
 pub(crate) mod cache;
 pub(crate) mod half;
+pub(crate) mod tune;
 
+use crate::device::Forms;
 use crate::session::Executor;
 use crate::{DeviceError, RunError};
 use raygrad_compiler::Program;
@@ -85,6 +87,8 @@ pub struct Adapter {
     pub api: &'static str,
     pub kind: AdapterKind,
     pub driver: String,
+    /// What it has for half precision, if it stores halves.
+    pub half: Option<Half>,
 }
 
 impl Adapter {
@@ -118,7 +122,7 @@ struct OnDevice<A: Api> {
 pub(crate) struct GpuExecutor<A: Api> {
     // First, so that a dropped session waits for its work before the buffers go.
     api: A,
-    half: Option<Half>,
+    forms: Forms,
     inputs: Inputs,
     /// Device buffers of the input arenas.
     arenas: Vec<A::Buffer>,
@@ -128,8 +132,15 @@ pub(crate) struct GpuExecutor<A: Api> {
 }
 
 impl<A: Api> GpuExecutor<A> {
-    pub fn new(api: A, half: Option<Half>) -> GpuExecutor<A> {
-        GpuExecutor { api, half, inputs: Inputs::default(), arenas: vec![], mirrors: BTreeMap::new(), programs: vec![] }
+    pub fn new(api: A, forms: Forms) -> GpuExecutor<A> {
+        GpuExecutor {
+            api,
+            forms,
+            inputs: Inputs::default(),
+            arenas: vec![],
+            mirrors: BTreeMap::new(),
+            programs: vec![],
+        }
     }
 
     fn lower_error(&self, e: LowerError) -> RunError {
@@ -163,7 +174,8 @@ impl<A: Api> Executor for GpuExecutor<A> {
         if program.target.kind != TargetKind::Gpu {
             return Err(RunError::Target(program.target.kind));
         }
-        let lowered = lower(&program, &mut self.inputs, &Limits { half: self.half, ..self.api.limits() })
+        let Forms { half, tiles } = self.forms;
+        let lowered = lower(&program, &mut self.inputs, &Limits { half, tiles, ..self.api.limits() })
             .map_err(|e| self.lower_error(e))?;
         for arena in &self.inputs.arenas[self.arenas.len()..] {
             self.arenas.push(self.api.buffer(arena)?);

@@ -27,7 +27,6 @@ pub struct Gpu {
     allocator: Mutex<Option<Allocator>>,
     adapter: Adapter,
     limits: Limits,
-    half: Option<Half>,
     clock: Option<Clock>,
     instance: Instance,
 }
@@ -77,15 +76,17 @@ impl Gpu {
             let portability = khr::portability_subset::NAME;
             let knows = |name: &CStr| known.iter().any(|e| e.extension_name_as_c_str() == Ok(name));
             let mut extensions: Vec<_> = knows(portability).then_some(portability.as_ptr()).into_iter().collect();
-            let half = half(&instance, physical, &knows);
-            let mut stored = vk::PhysicalDevice16BitStorageFeatures::default().storage_buffer16_bit_access(true);
+            // Modules of halves declare both kinds of access.
+            let mut stored = vk::PhysicalDevice16BitStorageFeatures::default()
+                .storage_buffer16_bit_access(true)
+                .uniform_and_storage_buffer16_bit_access(true);
             let mut computed = vk::PhysicalDeviceShaderFloat16Int8Features::default().shader_float16(true);
             let mut multiplied = vk::PhysicalDeviceCooperativeMatrixFeaturesKHR::default().cooperative_matrix(true);
             let mut model = vk::PhysicalDeviceVulkanMemoryModelFeatures::default()
                 .vulkan_memory_model(true)
                 .vulkan_memory_model_device_scope(true);
             let mut description = vk::DeviceCreateInfo::default().queue_create_infos(&queues);
-            if let Some(half) = half {
+            if let Some(half) = adapter.half {
                 extensions.push(khr::shader_float16_int8::NAME.as_ptr());
                 description = description.push_next(&mut stored).push_next(&mut computed);
                 if half.matrices.is_some() {
@@ -107,6 +108,7 @@ impl Gpu {
                 max_buffers: properties.limits.max_per_stage_descriptor_storage_buffers,
                 max_workgroups: properties.limits.max_compute_work_group_count[0],
                 max_workgroup_bytes: properties.limits.max_compute_shared_memory_size,
+                tiles: 0,
                 half: None,
             };
             let clock = (bits > 0).then(|| Clock {
@@ -141,7 +143,6 @@ impl Gpu {
                 family,
                 adapter,
                 limits,
-                half,
                 clock,
                 instance,
             })
@@ -161,11 +162,6 @@ impl Gpu {
 
     pub(super) fn limits(&self) -> Limits {
         self.limits
-    }
-
-    /// What it has for half precision, if it stores halves.
-    pub(crate) fn half(&self) -> Option<Half> {
-        self.half
     }
 
     pub(super) fn clock(&self) -> Option<Clock> {
@@ -229,7 +225,10 @@ fn describe_result(e: vk::Result) -> String {
 }
 
 /// What a device has for half precision.
-fn half(instance: &Instance, physical: vk::PhysicalDevice, knows: &dyn Fn(&CStr) -> bool) -> Option<Half> {
+fn half(instance: &Instance, physical: vk::PhysicalDevice) -> Option<Half> {
+    // SAFETY: a physical device of this instance.
+    let known = unsafe { instance.raw.enumerate_device_extension_properties(physical) }.unwrap_or_default();
+    let knows = |name: &CStr| known.iter().any(|e| e.extension_name_as_c_str() == Ok(name));
     if !knows(khr::shader_float16_int8::NAME) {
         return None;
     }
@@ -249,7 +248,9 @@ fn half(instance: &Instance, physical: vk::PhysicalDevice, knows: &dyn Fn(&CStr)
         instance.raw.get_physical_device_features2(physical, &mut features);
         instance.raw.get_physical_device_properties2(physical, &mut properties);
     }
-    if stored.storage_buffer16_bit_access != vk::TRUE || computed.shader_float16 != vk::TRUE {
+    let needed =
+        [stored.storage_buffer16_bit_access, stored.uniform_and_storage_buffer16_bit_access, computed.shader_float16];
+    if needed.contains(&vk::FALSE) {
         return None;
     }
     let has_matrices = may_multiply
@@ -308,5 +309,6 @@ fn describe(instance: &Instance, physical: vk::PhysicalDevice) -> Adapter {
             vk::api_version_minor(version),
             vk::api_version_patch(version)
         ),
+        half: half(instance, physical),
     }
 }

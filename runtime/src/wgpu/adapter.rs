@@ -16,7 +16,6 @@ pub struct Gpu {
     pub(super) queue: api::Queue,
     adapter: Adapter,
     limits: Limits,
-    half: Option<Half>,
     /// Compiled pipelines, where the API lets them out.
     cache: Option<(CacheFile, api::PipelineCache)>,
     /// The first error nobody was asked about: wgpu reports most of them late.
@@ -45,7 +44,7 @@ impl Gpu {
     fn on(adapter: &api::Adapter) -> Result<Gpu, DeviceError> {
         let info = describe(adapter);
         let limits = adapter.limits();
-        let half = half(adapter);
+        let half = info.half;
         let mut features = api::Features::TIMESTAMP_QUERY | api::Features::PIPELINE_CACHE | api::Features::SHADER_F16;
         let mut experimental = api::ExperimentalFeatures::disabled();
         if half.is_some_and(|h| h.matrices.is_some()) {
@@ -84,6 +83,7 @@ impl Gpu {
             max_buffers: limits.max_storage_buffers_per_shader_stage,
             max_workgroups: limits.max_compute_workgroups_per_dimension,
             max_workgroup_bytes: limits.max_compute_workgroup_storage_size,
+            tiles: 0,
             half: None,
         };
         let key = api::util::pipeline_cache_key(&adapter.get_info());
@@ -97,7 +97,7 @@ impl Gpu {
             // SAFETY: the data came out of such a cache (a hash says so), and wgpu refuses those of another driver.
             (file, unsafe { device.create_pipeline_cache(&description) })
         });
-        Ok(Gpu { device, queue, adapter: info, limits, half, cache, failed })
+        Ok(Gpu { device, queue, adapter: info, limits, cache, failed })
     }
 
     /// The same device as if a kernel could bind no more than so many bytes of a buffer at once: larger buffers then lie in
@@ -122,11 +122,6 @@ impl Gpu {
 
     pub(super) fn limits(&self) -> Limits {
         self.limits
-    }
-
-    /// What it has for half precision, if it stores halves.
-    pub(crate) fn half(&self) -> Option<Half> {
-        self.half
     }
 
     pub(super) fn problem(&self, problem: String) -> RunError {
@@ -223,6 +218,7 @@ fn describe(adapter: &api::Adapter) -> Adapter {
         api: info.backend.to_str(),
         kind: kind(info.device_type),
         driver: format!("{} {}", info.driver, info.driver_info).trim().to_string(),
+        half: half(adapter),
     }
 }
 

@@ -87,6 +87,9 @@ struct Choice {
     /// `f32`, or `mixed`: matrix products of halves, on GPUs that have them.
     #[arg(long, value_name = "PRECISION")]
     precision: Option<String>,
+    /// On GPUs, first try which tiles run a step fastest. What is found is kept, so that later runs begin at once.
+    #[arg(long)]
+    autotune: bool,
 }
 
 impl Choice {
@@ -105,6 +108,9 @@ impl Choice {
             ("--precision", "run.precision", &self.precision),
         ];
         set_options(&mut experiment, &options)?;
+        if self.autotune {
+            experiment.set_option("--autotune", "run.autotune", "true")?;
+        }
         Ok(experiment)
     }
 }
