@@ -153,6 +153,8 @@ impl Kernel {
             zero_initialize_workgroup_memory: spv::ZeroInitializeWorkgroupMemoryMode::None,
             force_loop_bounding: false,
             emit_int_div_checks: false,
+            // Kernels pass no halves between stages, which not every device can.
+            use_storage_input_output_16: false,
             ..Default::default()
         };
         spv::write_vec(&self.module, &self.info, &options, None).map_err(|e| self.write_error(&e))
