@@ -11,7 +11,7 @@
 pub mod aligned;
 pub mod gemm;
 pub mod isa;
-mod math;
+pub(crate) mod math;
 pub mod outer;
 pub mod panels;
 pub mod peak;

@@ -62,6 +62,14 @@ pub struct Matrices {
     pub subgroup: u32,
 }
 
+impl Matrices {
+    /// If tiles are made for subgroups of so many invocations: a workgroup needs at least four.
+    pub fn new(side: u32, subgroup: u32) -> Option<Matrices> {
+        ([8, 16].contains(&side) && (4..=64).contains(&subgroup) && subgroup.is_power_of_two())
+            .then_some(Matrices { side, subgroup })
+    }
+}
+
 /// How a lane is stored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Storage {

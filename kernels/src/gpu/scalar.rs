@@ -1,28 +1,13 @@
 //! Scalar programs as naga expressions, on scalars or on vectors of four.
 //!
 //! Where a device's function is only loosely specified, it is built from others: Vulkan promises 2^-11 for `sin`, and nothing
-//! outside `[-pi, pi]`, 4096 ulp for `atan2`, and no digits for `tanh` near 0.
+//! outside `[-pi, pi]`, 4096 ulp for `atan2`, and no digits for `tanh` near 0. The polynomials are those of the CPU kernels.
 
 use super::builder::{Builder, Kind, Value};
+use crate::cpu::math::{ATAN, SIN, TANH};
 use naga::{BinaryOperator as Op, MathFunction as Math, UnaryOperator};
 use raygrad_compiler::scalar::{Prim, ScalarProgram, Val};
 use std::f32::consts;
-
-/// `(sin(r) / r - 1) / r^2` in `r^2`, for `|r| <= pi / 2`; the CPU kernels use the same.
-const SIN: [f32; 4] = [-0.166_666_6, 0.008_333_069, -0.000_198_097_67, 2.606_047e-6];
-/// `(tanh(x) / x - 1) / x^2` in `x^2`, for `|x| <= 0.63`; the CPU kernels use the same.
-const TANH: [f32; 5] = [-0.333_332_78, 0.133_313_2, -0.053_729_13, 0.020_603_238, -0.005_663_615];
-/// `(atan(t) / t - 1) / t^2` in `t^2`, for `|t| <= 1`.
-const ATAN: [f32; 8] = [
-    -0.333_331_53,
-    0.199_937_69,
-    -0.142_110_24,
-    0.106_658_93,
-    -0.075_519_934,
-    0.043_209_426,
-    -0.016_366_52,
-    0.002_920_359_8,
-];
 
 /// Emits `program` on `inputs`; the result has the type `kind`.
 pub(super) fn emit(b: &mut Builder, program: &ScalarProgram, inputs: &[Value], kind: Kind) -> Value {

@@ -12,6 +12,8 @@ use naga::BuiltIn;
 
 /// Workgroups that keep a device busy.
 const ENOUGH: u64 = 128;
+/// Invocations of a workgroup that every device can start.
+const MOST_INVOCATIONS: u32 = 256;
 /// Terms of sums after which writing them does not count.
 const LONG: usize = 1024;
 
@@ -34,7 +36,7 @@ impl Tile {
     pub fn of(limits: &Limits, (m, n, k): (usize, usize, usize), products: usize) -> Tile {
         let fits = |t: &Tile| {
             let workgroups = m.div_ceil(t.m as usize) as u64 * n.div_ceil(t.n as usize) as u64 * products as u64;
-            workgroups >= ENOUGH && t.bytes() <= limits.max_workgroup_bytes
+            workgroups >= ENOUGH && t.bytes() <= limits.max_workgroup_bytes && t.invocations() <= MOST_INVOCATIONS
         };
         let skipped = limits.tiles as usize;
         if let Some(matrices) = limits.half.and_then(|h| h.matrices)

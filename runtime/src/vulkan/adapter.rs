@@ -258,7 +258,7 @@ fn half(instance: &Instance, physical: vk::PhysicalDevice) -> Option<Half> {
         && model.vulkan_memory_model == vk::TRUE
         && model.vulkan_memory_model_device_scope == vk::TRUE;
     let side = if has_matrices { matrix_side(instance, physical) } else { None };
-    Some(Half { matrices: side.map(|side| Matrices { side, subgroup: groups.subgroup_size }) })
+    Some(Half { matrices: side.and_then(|side| Matrices::new(side, groups.subgroup_size)) })
 }
 
 /// Side of square matrices of halves that a subgroup multiplies, summed in single precision.

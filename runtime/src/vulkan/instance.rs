@@ -3,7 +3,7 @@
 use crate::DeviceError;
 use ash::{ext, khr, vk};
 use std::ffi::{CStr, c_char, c_void};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, OnceLock, PoisonError};
 
 /// `RAYGRAD_VULKAN_VALIDATION=1` loads this layer; what it says becomes an error.
 const VALIDATION: &CStr = c"VK_LAYER_KHRONOS_validation";
@@ -23,7 +23,6 @@ pub(super) struct Instance {
     validation: Option<(ext::debug_utils::Instance, vk::DebugUtilsMessengerEXT)>,
     /// What the messenger writes to.
     pub complaints: Box<Complaints>,
-    /// The loader's library stays open while the instance lives.
     pub entry: ash::Entry,
 }
 
@@ -31,7 +30,7 @@ impl Instance {
     pub fn new() -> Result<Instance, DeviceError> {
         // SAFETY: the loader is the system's, and all calls below are made with handles of this instance.
         unsafe {
-            let entry = ash::Entry::load().map_err(|e| unavailable(&e))?;
+            let entry = loader()?;
             let version = entry.try_enumerate_instance_version().ok().flatten().unwrap_or(vk::API_VERSION_1_0);
             if version < vk::API_VERSION_1_1 {
                 return Err(unavailable(&"the loader knows Vulkan 1.0 only, 1.1 is needed"));
@@ -86,6 +85,15 @@ impl Instance {
             Ok(instance)
         }
     }
+}
+
+/// The loader's library, once opened, stays open until the process ends: with it drivers stay loaded, whose own data of a
+/// thread are cleared when that thread ends, by code that must be there then.
+fn loader() -> Result<ash::Entry, DeviceError> {
+    static LOADER: OnceLock<Result<ash::Entry, String>> = OnceLock::new();
+    // SAFETY: the loader is the system's.
+    let loader = LOADER.get_or_init(|| unsafe { ash::Entry::load() }.map_err(|e| e.to_string()));
+    loader.clone().map_err(|e| unavailable(&e))
 }
 
 impl Drop for Instance {

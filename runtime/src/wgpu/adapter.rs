@@ -187,7 +187,7 @@ fn half(adapter: &api::Adapter) -> Option<Half> {
         .max();
     let fixed = info.subgroup_min_size == info.subgroup_max_size;
     let side = side.filter(|_| features.contains(needed) && fixed);
-    Some(Half { matrices: side.map(|side| Matrices { side, subgroup: info.subgroup_min_size }) })
+    Some(Half { matrices: side.and_then(|side| Matrices::new(side, info.subgroup_min_size)) })
 }
 
 fn note(slot: &Mutex<Option<String>>, what: String) {
