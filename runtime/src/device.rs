@@ -4,7 +4,7 @@ use crate::{DeviceError, RunError};
 use raygrad_compiler::{Program, Target};
 use raygrad_kernels::cpu::Isa;
 #[cfg(feature = "gpu")]
-use raygrad_kernels::gpu::{Half, Limits, storages};
+use raygrad_kernels::gpu::{Half, storages};
 use std::sync::Arc;
 
 /// A device to run sessions on.
@@ -26,7 +26,7 @@ pub enum Device {
 pub struct Forms {
     /// What kernels use for half precision; `None` at single precision.
     pub half: Option<Half>,
-    /// How many of the largest tiles not to use ([`Limits::tiles`]).
+    /// How many of the largest tiles not to use ([`raygrad_kernels::gpu::Limits::tiles`]).
     pub tiles: u32,
 }
 
@@ -125,16 +125,22 @@ impl Device {
         }
     }
 
-    /// What the device has for half precision, if it stores halves.
+    /// The adapter, where the device is one.
     #[cfg(feature = "gpu")]
-    pub fn has_half(&self) -> Option<Half> {
+    pub(crate) fn adapter(&self) -> Option<&crate::Adapter> {
         match self {
             Device::Cpu { .. } => None,
             #[cfg(feature = "wgpu")]
-            Device::Wgpu { gpu, .. } => gpu.adapter().half,
+            Device::Wgpu { gpu, .. } => Some(gpu.adapter()),
             #[cfg(feature = "vulkan")]
-            Device::Vulkan { gpu, .. } => gpu.adapter().half,
+            Device::Vulkan { gpu, .. } => Some(gpu.adapter()),
         }
+    }
+
+    /// What the device has for half precision, if it stores halves.
+    #[cfg(feature = "gpu")]
+    pub fn has_half(&self) -> Option<Half> {
+        self.adapter()?.half
     }
 
     /// The same device with what kernels may use for half precision.
@@ -190,8 +196,7 @@ impl Device {
     pub fn lane_bytes(&self, program: &Program) -> Vec<u64> {
         #[cfg(feature = "gpu")]
         if self.half().is_some() {
-            let limits = Limits { half: self.half(), ..Limits::default() };
-            return storages(program, &limits).iter().map(|s| s.bytes()).collect();
+            return storages(program, true).iter().map(|s| s.bytes()).collect();
         }
         vec![4; program.buffers.len()]
     }

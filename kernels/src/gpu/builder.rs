@@ -7,7 +7,7 @@
 //!
 //! One file above 400 lines: all of it keeps the same few invariants of the block that is being written.
 
-use super::layout::Storage;
+use super::half::Storage;
 use naga::{
     AddressSpace, ArraySize, BinaryOperator, Block, Expression, Function, GlobalVariable, Handle, Literal,
     LocalVariable, MathFunction, Module, Range, ResourceBinding, Scalar, ScalarKind, Span, Statement, StorageAccess,

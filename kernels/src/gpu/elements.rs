@@ -200,19 +200,15 @@ fn kernel(
         if c.by_lane { elements * channels } else { elements }
     };
     if let [only] = components {
-        let (mut e, number) = Emit::over(layout, limits, count(only))?;
-        if fours {
-            e = e.with_vectors();
-        }
+        let (e, number) = Emit::over(layout, limits, count(only))?;
+        let mut e = e.with_vectors(fours);
         segment(&mut e, region, only, number, fours);
         return e.finish(name);
     }
     let padded = |c: &Component| count(c).next_multiple_of(WORKGROUP as u64);
     let total = components.iter().map(padded).sum();
-    let (mut e, number) = Emit::over(layout, limits, total)?;
-    if fours {
-        e = e.with_vectors();
-    }
+    let (e, number) = Emit::over(layout, limits, total)?;
+    let mut e = e.with_vectors(fours);
     let mut first = 0;
     for (i, component) in components.iter().enumerate() {
         let end = first + padded(component);
@@ -224,15 +220,8 @@ fn kernel(
         let start = e.b.u(first as u32);
         let own = e.b.sub(number, start);
         let spare = padded(component) != count(component);
-        if spare {
-            let count = e.b.u(count(component) as u32);
-            let inside = e.b.less(own, count);
-            e.b.open_if(inside);
-        }
-        segment(&mut e, region, component, own, fours);
-        if spare {
-            e.b.close_if();
-        }
+        let guard = spare.then_some(count(component) as u32);
+        e.if_below(own, guard, |e| segment(e, region, component, own, fours));
         if i + 1 < components.len() {
             e.b.open_else();
         }
@@ -257,16 +246,9 @@ fn in_fours(region: &Region, components: &[Component]) -> bool {
 fn segment(e: &mut Emit, region: &Region, component: &Component, number: Value, fours: bool) {
     let elements = region.domain.elements() as u32;
     let each = if fours { 4 } else { 1 };
-    let values_at = |e: &mut Emit, first: Value| -> Values<'_> {
-        if !fours {
-            return Values::new(region, vec![Position::new(&region.domain, first)]);
-        }
-        let all = [0, 1, 2, 3].map(|i| {
-            let offset = e.b.u(i);
-            Position::new(&region.domain, e.b.add(first, offset))
-        });
-        Values::new(region, all.to_vec()).side_by_side(&region.domain)
-    };
+    let domain = &region.domain;
+    let values_at =
+        |e: &mut Emit, first: Value| Values::from(e, region, (domain, first, fours), |at| Position::new(domain, at));
     if component.by_lane {
         let per_channel = e.b.u(elements / each);
         let (channel, element) = (e.b.div(number, per_channel), e.b.rem(number, per_channel));

@@ -60,6 +60,23 @@ impl<'r> Values<'r> {
         }
     }
 
+    /// Values at an element of `rows`, or if `fours` at four neighbours from it on; `position` is where an element is.
+    pub fn from(
+        e: &mut Emit,
+        region: &'r Region,
+        (rows, first, fours): (&Axes, Value, bool),
+        position: impl Fn(Value) -> Position,
+    ) -> Values<'r> {
+        if !fours {
+            return Values::new(region, vec![position(first)]);
+        }
+        let all = [0, 1, 2, 3].map(|i| {
+            let offset = e.b.u(i);
+            position(e.b.add(first, offset))
+        });
+        Values::new(region, all.to_vec()).side_by_side(rows)
+    }
+
     /// Says that the positions are four neighbours in `rows`, the first at a multiple of four, so that a kernel `with_vectors`
     /// loads them at once.
     pub fn side_by_side(mut self, rows: &Axes) -> Values<'r> {

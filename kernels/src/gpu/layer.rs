@@ -4,11 +4,13 @@ use super::builder::Value;
 use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
 use super::memory::{Emit, Position, is_run};
-use super::tile::{Along, Four, Operand, Tile, multiply, split};
+use super::parts::{empty, push_load};
+use super::sums::Four;
+use super::tile::{Along, Operand, Tile, multiply, split};
 use super::{Kernel, LowerError, elements};
 use naga::MathFunction as Math;
-use raygrad_compiler::graph::{Axes, Shape};
-use raygrad_compiler::plan::region::{BufferId, Inst, InstId, Region, RegionOp, Store, Weights};
+use raygrad_compiler::graph::Axes;
+use raygrad_compiler::plan::region::{BufferId, InstId, Region, RegionOp, Store, Weights};
 use raygrad_compiler::scalar::DType;
 use std::ops::Range;
 
@@ -33,9 +35,11 @@ pub(super) fn kernels(
     let several = stretches.len() > 1;
     let rows = row_axes.elements();
     let (mut weights, mut all) = (*weights, vec![]);
-    if limits.half.is_some_and(|h| h.matrices.is_some()) && weights.rows.min(weights.columns) > 32 && rows >= MANY_ROWS
+    let multiplied = limits.half.is_some_and(|h| h.matrices.is_some()) && weights.rows.min(weights.columns) > 32;
+    if multiplied
+        && rows >= MANY_ROWS
+        && let Some((halves, kernels)) = halved(layout, limits, name, region, &weights)?
     {
-        let (halves, kernels) = halved(layout, limits, name, region, &weights)?;
         all.extend(kernels);
         weights = halves;
     }
@@ -62,37 +66,23 @@ pub(super) fn kernels(
 /// Rows from which weights are read so often that they are made halves first.
 const MANY_ROWS: usize = 1 << 14;
 
-/// Weights as halves, in scratch memory that the kernels fill.
+/// Weights as halves, in scratch memory that the kernels fill; `None` where they cannot be seen as a buffer of their own.
 fn halved(
     layout: &mut Layout,
     limits: Limits,
     name: &str,
     region: &Region,
     weights: &Weights,
-) -> Result<(Weights, Vec<Kernel>), LowerError> {
-    let shape = layout.shape(weights.buffer).clone();
+) -> Result<Option<(Weights, Vec<Kernel>)>, LowerError> {
     let count = weights.rows * weights.columns;
-    let halves = layout.scratch_for_product("weights", Shape::of(shape.axes.clone(), count, DType::F32))?;
-    let inst = |op, inputs, channels| Inst {
-        op,
-        inputs,
-        axes: shape.axes.clone(),
-        channels,
-        dtype: DType::F32,
-        label: "weights".into(),
-        source: std::panic::Location::caller(),
-    };
-    let mut body = vec![inst(RegionOp::Load(weights.buffer), vec![], shape.channels.count())];
-    if count < shape.channels.count() {
-        let own: Vec<(u32, u32)> = (weights.first..weights.first + count).map(|c| (0, c as u32)).collect();
-        body.push(inst(RegionOp::Pick(own.into()), vec![InstId(0)], count));
-    }
-    let value = InstId(body.len() as u32 - 1);
-    let stores = vec![Store::Write { value, buffer: halves }];
-    let inner = shape.axes.last().cloned();
-    let copy = Region { domain: shape.axes.clone(), inner, body, stores, whole: false, ..region.clone() };
+    let Some(own) = layout.slice(weights.buffer, weights.first..weights.first + count) else { return Ok(None) };
+    let shape = layout.shape(own).clone();
+    let mut copy = Region { domain: shape.axes.clone(), inner: shape.axes.last().cloned(), ..empty(region) };
+    let buffer = layout.scratch_for_product("weights", shape)?;
+    let value = push_load(layout, &mut copy, own);
+    copy.stores.push(Store::Write { value, buffer });
     let kernels = elements::kernels(layout, limits, &format!("{name}.halves"), &copy)?;
-    Ok((Weights { buffer: halves, first: 0, ..*weights }, kernels))
+    Ok(Some((Weights { buffer, first: 0, ..*weights }, kernels)))
 }
 
 struct Layer<'r> {
@@ -124,7 +114,7 @@ impl Layer<'_> {
         let count = self.columns.end - self.columns.start;
         let (row_tiles, column_tiles) = (self.rows.div_ceil(tile.m), count.div_ceil(tile.n));
         let groups = self.batch_axes.elements() as u64 * row_tiles as u64 * column_tiles as u64;
-        let mut e = Emit::new(layout, limits, groups, tile.invocations())?.with_vectors();
+        let mut e = Emit::new(layout, limits, groups, tile.invocations())?.with_vectors(true);
         if e.spare_workgroups() {
             e.leave_from(e.workgroup, groups as u32);
         }
@@ -191,15 +181,7 @@ impl Layer<'_> {
             all.push(Found { row: *row, column: own, elements: elements.clone(), results: results.collect() });
         }
         for found in &all {
-            if !whole {
-                let end = e.b.u(self.columns.end);
-                let inside = e.b.less(found.column, end);
-                e.b.open_if(inside);
-            }
-            self.write(e, found);
-            if !whole {
-                e.b.close_if();
-            }
+            e.if_below(found.column, (!whole).then_some(self.columns.end), |e| self.write(e, found));
         }
     }
 
@@ -319,38 +301,31 @@ impl Layer<'_> {
     fn write(&self, e: &mut Emit, found: &Found) {
         let Found { row, column, elements, results } = found;
         let (row, column) = (*row, *column);
-        let certain = self.rows.is_multiple_of(self.tile.m);
         if self.in_fours() {
-            if !certain {
-                let rows = e.b.u(self.rows);
-                let inside = e.b.less(row, rows);
-                e.b.open_if(inside);
-            }
-            for (buffer, result) in results {
-                let floats = e.layout.shape(*buffer).dtype == DType::F32;
-                if floats && is_run(&self.region.domain, &self.row_axes) {
-                    let at = e.index(*buffer, column, elements[0]);
-                    e.store_four(*buffer, at, *result);
-                    continue;
+            let certain = self.rows.is_multiple_of(self.tile.m);
+            e.if_below(row, (!certain).then_some(self.rows), |e| {
+                for (buffer, result) in results {
+                    let floats = e.layout.shape(*buffer).dtype == DType::F32;
+                    if floats && is_run(&self.region.domain, &self.row_axes) {
+                        let at = e.index(*buffer, column, elements[0]);
+                        e.store_four(*buffer, at, *result);
+                        continue;
+                    }
+                    for (lane, element) in elements.iter().enumerate() {
+                        self.write_lane(e, (*buffer, *result), column, (lane as u32, *element));
+                    }
                 }
-                for (lane, element) in elements.iter().enumerate() {
-                    self.write_lane(e, (*buffer, *result), column, (lane as u32, *element));
-                }
-            }
-            if !certain {
-                e.b.close_if();
-            }
+            });
             return;
         }
         for (lane, element) in elements.iter().enumerate() {
-            let (offset, rows) = (e.b.u(lane as u32), e.b.u(self.rows));
+            let offset = e.b.u(lane as u32);
             let own = e.b.add(row, offset);
-            let inside = e.b.less(own, rows);
-            e.b.open_if(inside);
-            for result in results {
-                self.write_lane(e, *result, column, (lane as u32, *element));
-            }
-            e.b.close_if();
+            e.if_below(own, Some(self.rows), |e| {
+                for result in results {
+                    self.write_lane(e, *result, column, (lane as u32, *element));
+                }
+            });
         }
     }
 

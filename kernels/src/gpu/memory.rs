@@ -1,7 +1,8 @@
 //! A kernel being built: naga statements, the arenas it binds, and positions in the domain.
 
 use super::builder::{Builder, Kind, Memory, Value};
-use super::layout::{Arena, ArenaId, Half, Layout, Limits, Part, Place, Storage};
+use super::half::{Half, Storage};
+use super::layout::{Arena, ArenaId, Layout, Limits, Part, Place};
 use super::{Access, Binding, Kernel, LowerError};
 use naga::BuiltIn;
 use naga::valid::Capabilities;
@@ -61,9 +62,9 @@ impl<'l, 'a> Emit<'l, 'a> {
         })
     }
 
-    /// Binds float arenas as vectors of four lanes, for kernels that mostly access four neighbours at once.
-    pub fn with_vectors(mut self) -> Emit<'l, 'a> {
-        self.vectors = true;
+    /// Binds float arenas as vectors of four lanes if `vectors`, for kernels that mostly access four neighbours at once.
+    pub fn with_vectors(mut self, vectors: bool) -> Emit<'l, 'a> {
+        self.vectors = vectors;
         self
     }
 
@@ -78,6 +79,16 @@ impl<'l, 'a> Emit<'l, 'a> {
             e.leave_from(number, count as u32);
         }
         Ok((e, number))
+    }
+
+    /// Does something where `number` is below `end`; everywhere, if there is none.
+    pub fn if_below(&mut self, number: Value, end: Option<u32>, body: impl FnOnce(&mut Self)) {
+        let Some(end) = end else { return body(self) };
+        let end = self.b.u(end);
+        let inside = self.b.less(number, end);
+        self.b.open_if(inside);
+        body(self);
+        self.b.close_if();
     }
 
     /// Ends invocations whose `number` is not below `count`.

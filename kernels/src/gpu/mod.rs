@@ -3,18 +3,21 @@
 //! | module | what |
 //! |---|---|
 //! | `builder`, `naming` | naga IR, statement by statement |
-//! | `layout` | where buffers lie: a few arenas |
+//! | `layout`, `half` | where buffers lie: a few arenas; what is stored in half precision |
 //! | `memory` | a kernel being built: arenas bound, positions in the domain |
 //! | `channels`, `eval`, `scalar`, `eigen` | values of a region at a position |
 //! | `parts`, `stages` | a region cut into what one kind of kernel does, and long work into stages |
-//! | `elements`, `reduce`, `scatter`, `scan`, `layer`, `outer`, `tile` | the kinds of kernels |
+//! | `elements`, `reduce`, `chunks`, `scatter`, `scan`, `layer`, `outer` | the kinds of kernels |
+//! | `tile`, `sums` | matrix products in tiles |
 //! | `peak` | kernels that measure a device |
 
 mod builder;
 mod channels;
+mod chunks;
 mod eigen;
 mod elements;
 mod eval;
+mod half;
 mod layer;
 mod layout;
 mod memory;
@@ -27,9 +30,11 @@ mod scalar;
 mod scan;
 mod scatter;
 mod stages;
+mod sums;
 mod tile;
 
-pub use layout::{Arena, ArenaId, Half, Inputs, Limits, Matrices, Part, Place, Storage, TILES, storages};
+pub use half::{Half, Matrices, Storage, storages};
+pub use layout::{Arena, ArenaId, Inputs, Limits, Part, Place, TILES};
 
 pub use peak::{copy, matrix_products, multiply_adds};
 

@@ -2,9 +2,9 @@
 //! kernel sums in order.
 
 use super::builder::Value;
+use super::chunks::{End, finish};
 use super::layout::{Layout, Limits};
 use super::memory::{Emit, Position, is_run};
-use super::reduce::{End, finish};
 use super::tile::{Along, Operand, Tile, multiply, split};
 use super::{Kernel, LowerError};
 use naga::MathFunction as Math;
@@ -42,53 +42,39 @@ pub(super) fn kernels(
     let swapped = outputs > 32;
     let (x, d) = (side(*x_buffer, inputs), side(*d_buffer, outputs));
     let (m, n) = if swapped { (d, x) } else { (x, d) };
-    let mut parts: Vec<(Side, Side)> = vec![];
-    for channels in split(n.channels.len()) {
-        let n = Side { channels, ..n.clone() };
-        parts.extend(split(m.channels.len()).into_iter().map(|c| (Side { channels: c, ..m.clone() }, n.clone())));
-    }
-    let lanes = inputs * outputs * kept;
-    let mut outers = vec![];
-    for (m, n) in parts {
-        // A narrow tile is narrow along n.
-        let ((m, n), swapped) = if m.channels.len() < 32 { ((n, m), !swapped) } else { ((m, n), swapped) };
-        let products = kept * rows.div_ceil(CHUNK_ROWS).min(MAX_CHUNKS);
-        let tile = Tile::of(&limits, (m.channels.len(), n.channels.len(), rows), products);
-        outers.push(Outer {
-            m,
-            n,
-            swapped,
-            tile,
-            inputs,
-            outputs,
-            rows,
-            to: *buffer,
-            per_chunk: rows,
-            keep: keep.clone(),
-            over: over.clone(),
-        });
+    let products = kept * rows.div_ceil(CHUNK_ROWS).min(MAX_CHUNKS);
+    let mut parts: Vec<Part> = vec![];
+    for n_channels in split(n.channels.len()) {
+        for m_channels in split(m.channels.len()) {
+            let (m, n) = (m.part(m_channels), n.part(n_channels.clone()));
+            let turned = m.channels.len() < 32;
+            let (m, n) = if turned { (n, m) } else { (m, n) };
+            let tile = Tile::of(&limits, (m.channels.len(), n.channels.len(), rows), products);
+            parts.push(Part { m, n, swapped: swapped != turned, tile });
+        }
     }
     // All parts have the same chunks, so that one kernel sums them.
-    let groups: usize = outers.iter().map(|o| o.tiles() * kept).max().unwrap_or(1);
-    let enough = if outers.iter().any(|o| o.tile.invocations() > 64) { ENOUGH } else { ENOUGH_SMALL };
+    let groups: usize = parts.iter().map(|p| p.tiles() * kept).max().unwrap_or(1);
+    let enough = if parts.iter().any(|p| p.tile.invocations() > 64) { ENOUGH } else { ENOUGH_SMALL };
     let wanted = enough.div_ceil(groups).min(rows.div_ceil(CHUNK_ROWS)).min(MAX_CHUNKS);
-    let depth = outers.iter().map(|o| o.tile.k).max().unwrap_or(1) as usize;
+    let depth = parts.iter().map(|p| p.tile.k).max().unwrap_or(1) as usize;
     let per_chunk = rows.div_ceil(wanted).next_multiple_of(depth);
     let chunks = rows.div_ceil(per_chunk);
-    let partials = match chunks {
+    let lanes = inputs * outputs * kept;
+    let to = match chunks {
         1 => *buffer,
         _ => layout.scratch("partial", Shape::of(Axes::none(), chunks * lanes, DType::F32))?,
     };
-    let several = outers.len() > 1;
+    let several = parts.len() > 1;
+    let outer = Outer { inputs, outputs, rows, to, per_chunk, keep, over };
     let mut all = vec![];
-    for (i, outer) in outers.iter_mut().enumerate() {
-        (outer.per_chunk, outer.to) = (per_chunk, partials);
+    for (i, part) in parts.iter().enumerate() {
         let name = if several { format!("{name}.{}", i + 1) } else { name.to_string() };
-        all.push(outer.kernel(layout, limits, &name)?);
+        all.push(outer.kernel(layout, limits, &name, part)?);
     }
     if chunks > 1 {
         let end = End { buffer: *buffer, first: 0, lanes, kind: Reduction::Sum };
-        all.push(finish(layout, limits, &format!("{name}.finish"), partials, chunks, &[end])?);
+        all.push(finish(layout, limits, &format!("{name}.finish"), to, chunks, &[end])?);
     }
     Ok(all)
 }
@@ -100,12 +86,28 @@ struct Side {
     channels: Range<usize>,
 }
 
-struct Outer {
+impl Side {
+    fn part(&self, channels: Range<usize>) -> Side {
+        Side { channels, ..self.clone() }
+    }
+}
+
+/// What one kernel computes: some channels of either side.
+struct Part {
     m: Side,
     n: Side,
     /// Whether m counts outputs, and n inputs.
     swapped: bool,
     tile: Tile,
+}
+
+impl Part {
+    fn tiles(&self) -> usize {
+        self.m.channels.len().div_ceil(self.tile.m as usize) * self.n.channels.len().div_ceil(self.tile.n as usize)
+    }
+}
+
+struct Outer {
     inputs: usize,
     outputs: usize,
     rows: usize,
@@ -116,18 +118,14 @@ struct Outer {
 }
 
 impl Outer {
-    fn tiles(&self) -> usize {
-        self.m.channels.len().div_ceil(self.tile.m as usize) * self.n.channels.len().div_ceil(self.tile.n as usize)
-    }
-
-    fn kernel(&self, layout: &Layout, limits: Limits, name: &str) -> Result<Kernel, LowerError> {
-        let tile = self.tile;
+    fn kernel(&self, layout: &Layout, limits: Limits, name: &str, part: &Part) -> Result<Kernel, LowerError> {
+        let tile = part.tile;
         let kept = self.keep.elements() as u32;
-        let tiles_m = (self.m.channels.len() as u32).div_ceil(tile.m);
-        let tiles_n = (self.n.channels.len() as u32).div_ceil(tile.n);
+        let tiles_m = (part.m.channels.len() as u32).div_ceil(tile.m);
+        let tiles_n = (part.n.channels.len() as u32).div_ceil(tile.n);
         let chunks = self.rows.div_ceil(self.per_chunk) as u32;
         let groups = chunks as u64 * kept as u64 * tiles_m as u64 * tiles_n as u64;
-        let mut e = Emit::new(layout, limits, groups, tile.invocations())?.with_vectors();
+        let mut e = Emit::new(layout, limits, groups, tile.invocations())?.with_vectors(true);
         if e.spare_workgroups() {
             e.leave_from(e.workgroup, groups as u32);
         }
@@ -145,7 +143,7 @@ impl Outer {
             let first = e.b.mul(number, size);
             e.b.add(first, before)
         };
-        let (first_m, first_n) = (first(&mut e, &self.m, tile_m, tile.m), first(&mut e, &self.n, tile_n, tile.n));
+        let (first_m, first_n) = (first(&mut e, &part.m, tile_m, tile.m), first(&mut e, &part.n, tile_n, tile.n));
         e.b.name(first_m, "first_m");
         e.b.name(first_n, "first_n");
         let (length, rows) = (e.b.u(self.per_chunk as u32), e.b.u(self.rows as u32));
@@ -160,25 +158,18 @@ impl Outer {
             (from, to),
             Operand {
                 along: Along::K,
-                load: &mut |e, k, at| self.rows(e, (&self.m, tile.m), keep, first_m, k, at, true),
+                load: &mut |e, k, at| self.rows(e, (&part.m, tile.m, tile.k), keep, first_m, k, at, true),
             },
             Operand {
                 along: Along::K,
-                load: &mut |e, k, at| self.rows(e, (&self.n, tile.n), keep, first_n, k, at, false),
+                load: &mut |e, k, at| self.rows(e, (&part.n, tile.n, tile.k), keep, first_n, k, at, false),
             },
             &mut |e, sums| {
                 for four in sums {
                     let (m, n) = (e.b.add(first_m, four.m), e.b.add(first_n, four.n));
-                    let guarded = !self.n.channels.len().is_multiple_of(tile.n as usize);
-                    if guarded {
-                        let end = e.b.u(self.n.channels.end as u32);
-                        let inside = e.b.less(n, end);
-                        e.b.open_if(inside);
-                    }
-                    self.write(e, m, n, four.sums, keep, chunk_first);
-                    if guarded {
-                        e.b.close_if();
-                    }
+                    let guarded = !part.n.channels.len().is_multiple_of(tile.n as usize);
+                    let end = guarded.then_some(part.n.channels.end as u32);
+                    e.if_below(n, end, |e| self.write(e, part, (m, n), four.sums, (keep, chunk_first)));
                 }
             },
         );
@@ -186,8 +177,8 @@ impl Outer {
     }
 
     /// Lane of the product of input and output channels in a chunk's block.
-    fn lane(&self, e: &mut Emit, m: Value, n: Value, keep: Value, chunk_first: Value) -> Value {
-        let (input, output) = if self.swapped { (n, m) } else { (m, n) };
+    fn lane(&self, e: &mut Emit, part: &Part, (m, n): (Value, Value), (keep, chunk_first): (Value, Value)) -> Value {
+        let (input, output) = if part.swapped { (n, m) } else { (m, n) };
         let (outputs, kept) = (e.b.u(self.outputs as u32), e.b.u(self.keep.elements() as u32));
         let channel = e.b.mul(input, outputs);
         let channel = e.b.add(channel, output);
@@ -197,37 +188,26 @@ impl Outer {
     }
 
     /// Writes four neighbouring m of one n.
-    fn write(&self, e: &mut Emit, m: Value, n: Value, sum: Value, keep: Value, chunk_first: Value) {
-        let Range { start, end } = self.m.channels.clone();
-        let guarded = !(end - start).is_multiple_of(self.tile.m as usize);
+    fn write(&self, e: &mut Emit, part: &Part, (m, n): (Value, Value), sum: Value, block: (Value, Value)) {
+        let Range { start, end } = part.m.channels.clone();
+        let whole = (end - start).is_multiple_of(part.tile.m as usize);
+        let guard = (!whole).then_some(end as u32);
         let fours = [start, end, self.outputs].iter().all(|x| x.is_multiple_of(4));
-        if self.swapped && self.keep.elements() == 1 && fours {
-            if guarded {
-                let end = e.b.u(end as u32);
-                let inside = e.b.less(m, end);
-                e.b.open_if(inside);
-            }
-            let at = self.lane(e, m, n, keep, chunk_first);
-            e.store_four(self.to, at, sum);
-            if guarded {
-                e.b.close_if();
-            }
+        if part.swapped && self.keep.elements() == 1 && fours {
+            e.if_below(m, guard, |e| {
+                let at = self.lane(e, part, (m, n), block);
+                e.store_four(self.to, at, sum);
+            });
             return;
         }
         for lane in 0..4 {
             let offset = e.b.u(lane);
             let m = e.b.add(m, offset);
-            if guarded {
-                let end = e.b.u(end as u32);
-                let inside = e.b.less(m, end);
-                e.b.open_if(inside);
-            }
-            let at = self.lane(e, m, n, keep, chunk_first);
-            let value = e.b.component(sum, lane);
-            e.store(self.to, at, value);
-            if guarded {
-                e.b.close_if();
-            }
+            e.if_below(m, guard, |e| {
+                let at = self.lane(e, part, (m, n), block);
+                let value = e.b.component(sum, lane);
+                e.store(self.to, at, value);
+            });
         }
     }
 
@@ -237,7 +217,7 @@ impl Outer {
     fn rows(
         &self,
         e: &mut Emit,
-        (side, edge): (&Side, u32),
+        (side, edge, depth): (&Side, u32, u32),
         keep: Value,
         first: Value,
         row: Value,
@@ -245,7 +225,7 @@ impl Outer {
         zeros: bool,
     ) -> Value {
         e.b.topic("row");
-        let whole = self.rows.is_multiple_of(self.tile.k as usize);
+        let whole = self.rows.is_multiple_of(depth as usize);
         let mut channel = e.b.add(first, at);
         if !side.channels.len().is_multiple_of(edge as usize) {
             let last = e.b.u(side.channels.end as u32 - 1);

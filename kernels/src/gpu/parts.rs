@@ -7,7 +7,8 @@
 //! One file above 400 lines: the parts are cut by one pass that holds their common state.
 
 use super::elements::{self, closure};
-use super::layout::{Layout, Limits, is_multiplied};
+use super::half::is_multiplied;
+use super::layout::{Layout, Limits};
 use super::{Kernel, LowerError, layer, outer, reduce, scan, scatter, stages};
 use raygrad_compiler::graph::{Axes, Shape};
 use raygrad_compiler::ops::Reduction;
@@ -451,11 +452,11 @@ fn put_aside(layout: &mut Layout, original: &Region, parts: &mut Vec<Part>) -> R
 }
 
 /// The same loop without contents.
-fn empty(region: &Region) -> Region {
+pub(super) fn empty(region: &Region) -> Region {
     Region { body: vec![], stores: vec![], whole: false, ..region.clone() }
 }
 
-fn push_load(layout: &Layout, region: &mut Region, buffer: BufferId) -> InstId {
+pub(super) fn push_load(layout: &Layout, region: &mut Region, buffer: BufferId) -> InstId {
     let shape = layout.shape(buffer);
     region.body.push(Inst {
         op: RegionOp::Load(buffer),

@@ -1,7 +1,8 @@
 //! What a device does at best: chains of multiply-adds and of products of matrices in registers, and a copy.
 
 use super::builder::{Builder, Factor, Kind, MatrixAt, Value};
-use super::layout::{Arena, ArenaId, Half, Matrices, Storage};
+use super::half::{Half, Matrices, Storage};
+use super::layout::{Arena, ArenaId};
 use super::memory::validated;
 use super::{Access, Binding, GpuLaunch, GpuProgram, Kernel, LowerError};
 use naga::BuiltIn;

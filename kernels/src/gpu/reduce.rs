@@ -5,6 +5,7 @@
 
 use super::builder::{Builder, Kind, Memory, Value, Var};
 use super::channels::is_indexable;
+use super::chunks::{End, finish};
 use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
 use super::memory::{Emit, Position, WORKGROUP, is_run};
@@ -100,12 +101,12 @@ fn group(
     let (kept, rows) = (keep.elements(), over.elements());
     let channels = if by_lane { region.inst(region.stores[targets[0].store].values()[0]).channels } else { 1 };
     let results = kept * channels;
-    let fours = in_fours(layout, region, &over) && results >= FEW_ROWS;
-    let work = Reducer { region, targets, by_lane, keep, over, channels };
+    let fours = in_fours(layout, region, &over);
+    let work = Reducer { region, targets, by_lane, keep, over, channels, fours };
     if rows <= FEW_ROWS || results >= MANY_RESULTS && rows < 32768 {
         return Ok(vec![work.alone(layout, limits, name)?]);
     }
-    let chunk_rows = if fours { CHUNK_ROWS_OF_FOURS } else { CHUNK_ROWS };
+    let chunk_rows = if fours && results >= FEW_ROWS { CHUNK_ROWS_OF_FOURS } else { CHUNK_ROWS };
     let chunks = rows.div_ceil(chunk_rows).min(MAX_CHUNKS.min((MANY_RESULTS * 16).div_ceil(results)).max(1));
     let per_chunk = rows.div_ceil(chunks).next_multiple_of(WORKGROUP as usize);
     let chunks = rows.div_ceil(per_chunk);
@@ -142,6 +143,8 @@ struct Reducer<'r> {
     over: Axes,
     /// Channels that are a dimension of the dispatch.
     channels: usize,
+    /// Whether invocations of a chunk take four rows at a time.
+    fours: bool,
 }
 
 impl Reducer<'_> {
@@ -159,16 +162,7 @@ impl Reducer<'_> {
     /// Adds the values at one row, or with `fours` at four.
     fn step(&self, e: &mut Emit, fours: bool, totals: &[Var], (kept, channel, row): (Value, Value, Value)) {
         let position = |row| Position::new(&self.keep, kept).and(&self.over, row);
-        let mut values = match fours {
-            false => Values::new(self.region, vec![position(row)]),
-            true => {
-                let rows = [0, 1, 2, 3].map(|i| {
-                    let offset = e.b.u(i);
-                    e.b.add(row, offset)
-                });
-                Values::new(self.region, rows.map(position).to_vec()).side_by_side(&self.over)
-            }
-        };
+        let mut values = Values::from(e, self.region, (&self.over, row, fours), position);
         for (t, total) in self.targets.iter().zip(totals) {
             let id = self.region.stores[t.store].values()[0];
             let c = if self.by_lane { Channel::Var(channel) } else { Channel::At(t.channel) };
@@ -221,11 +215,8 @@ impl Reducer<'_> {
     ) -> Result<Kernel, LowerError> {
         let (kept_elements, rows) = (self.keep.elements(), self.over.elements());
         let results = kept_elements * self.channels;
-        let fours = in_fours(layout, self.region, &self.over);
-        let mut e = Emit::new(layout, limits, (chunks * results) as u64, WORKGROUP)?;
-        if fours {
-            e = e.with_vectors();
-        }
+        let fours = self.fours;
+        let mut e = Emit::new(layout, limits, (chunks * results) as u64, WORKGROUP)?.with_vectors(fours);
         if e.spare_workgroups() {
             e.leave_from(e.workgroup, (chunks * results) as u32);
         }
@@ -347,70 +338,4 @@ impl Reducer<'_> {
         e.b.close_loop();
         e.b.get(total)
     }
-}
-
-/// Lanes `first..first + lanes` of a buffer, as one stretch of a chunk's partial results.
-pub(super) struct End {
-    pub buffer: BufferId,
-    pub first: usize,
-    pub lanes: usize,
-    pub kind: Reduction,
-}
-
-/// Combines chunks: partial results lie chunk by chunk, each chunk with the stretches `ends` one after another.
-pub(super) fn finish(
-    layout: &Layout,
-    limits: Limits,
-    name: &str,
-    partials: BufferId,
-    chunks: usize,
-    ends: &[End],
-) -> Result<Kernel, LowerError> {
-    let per_chunk: usize = ends.iter().map(|x| x.lanes).sum();
-    // Neighbouring stretches of one buffer are one.
-    let mut merged: Vec<End> = vec![];
-    for end in ends {
-        match merged.last_mut() {
-            Some(m) if m.buffer == end.buffer && m.first + m.lanes == end.first && m.kind == end.kind => {
-                m.lanes += end.lanes
-            }
-            _ => merged.push(End { ..*end }),
-        }
-    }
-    let (mut e, number) = Emit::over(layout, limits, per_chunk as u64)?;
-    let sum = |e: &mut Emit, kind: Reduction| {
-        let start = neutral(&mut e.b, kind);
-        let total = e.b.var("total", start);
-        let (from, to) = (e.b.u(0), e.b.u(chunks as u32));
-        let chunk = e.b.open_loop("chunk", from, to, 1);
-        let stride = e.b.u(per_chunk as u32);
-        let at = e.b.mul(chunk, stride);
-        let at = e.b.add(at, number);
-        let next = e.load(partials, at);
-        let so_far = e.b.get(total);
-        let next = combine(&mut e.b, kind, so_far, next);
-        e.b.set(total, next);
-        e.b.close_loop();
-        e.b.get(total)
-    };
-    let mut from = 0;
-    for (i, end) in merged.iter().enumerate() {
-        let last = i + 1 == merged.len();
-        if !last {
-            let to = e.b.u((from + end.lanes) as u32);
-            let here = e.b.less(number, to);
-            e.b.open_if(here);
-        }
-        let total = sum(&mut e, end.kind);
-        let (before, first) = (e.b.u(from as u32), e.b.u(end.first as u32));
-        let at = e.b.sub(number, before);
-        let at = e.b.add(at, first);
-        e.store(end.buffer, at, total);
-        if !last {
-            e.b.open_else();
-        }
-        from += end.lanes;
-    }
-    (1..merged.len()).for_each(|_| e.b.close_if());
-    e.finish(name)
 }

@@ -6,13 +6,14 @@
 //! Where lines are too few to fill a device, the invocations of a workgroup share one: each runs along a stretch of it,
 //! beginning with the sum of what the ones before it have in theirs.
 
-use super::builder::{Kind, Value, Var};
+use super::builder::{Kind, Memory, Value, Var};
 use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
 use super::memory::{Emit, Position, WORKGROUP};
 use super::reduce::{combine, neutral};
 use super::{Kernel, LowerError};
 use raygrad_compiler::graph::{Axes, Axis, Shape};
+use raygrad_compiler::ops::Reduction;
 use raygrad_compiler::plan::region::{BufferId, InstId, Region, RegionOp, Store};
 use std::collections::HashMap;
 
@@ -215,19 +216,12 @@ impl<'r> Run<'r> {
         self.put(e, ends, &vars);
         e.b.barrier();
         for (i, var) in vars.iter().enumerate() {
-            let (zero, none, first) = (e.b.f(0.0), e.b.u(0), e.b.u(i as u32 * WORKGROUP));
-            e.b.set(*var, zero);
-            let other = e.b.open_loop("other", none, e.invocation, 1);
-            let at = e.b.add(first, other);
-            let (so_far, next) = (e.b.get(*var), e.b.load(ends, at));
-            let next = e.b.add(so_far, next);
-            e.b.set(*var, next);
-            e.b.close_loop();
+            gather(e, ends, i as u32, e.invocation, Reduction::Sum, *var);
         }
     }
 
     /// Every invocation's values of some variables, one after the other, to workgroup memory.
-    fn put(&self, e: &mut Emit, memory: super::builder::Memory, vars: &[Var]) {
+    fn put(&self, e: &mut Emit, memory: Memory, vars: &[Var]) {
         for (i, var) in vars.iter().enumerate() {
             let (value, first) = (e.b.get(*var), e.b.u(i as u32 * WORKGROUP));
             let at = e.b.add(e.invocation, first);
@@ -279,15 +273,8 @@ impl<'r> Run<'r> {
                     let own = e.b.u(number % WORKGROUP);
                     let mine = e.b.binary(naga::BinaryOperator::Equal, e.invocation, own);
                     e.b.open_if(mine);
-                    let (one, size, first) = (e.b.u(0), e.b.u(WORKGROUP), e.b.u(number * WORKGROUP));
-                    let start = neutral(&mut e.b, *kind);
-                    e.b.set(*var, start);
-                    let other = e.b.open_loop("other", one, size, 1);
-                    let at = e.b.add(first, other);
-                    let (so_far, next) = (e.b.get(*var), e.b.load(found, at));
-                    let next = combine(&mut e.b, *kind, so_far, next);
-                    e.b.set(*var, next);
-                    e.b.close_loop();
+                    let all = e.b.u(WORKGROUP);
+                    gather(e, found, number, all, *kind, *var);
                 }
                 let value = e.b.get(*var);
                 let c = e.b.u(c as u32);
@@ -300,6 +287,19 @@ impl<'r> Run<'r> {
             }
         }
     }
+}
+
+/// Combines into a variable what the first `count` invocations have put of value `number`, in order.
+fn gather(e: &mut Emit, memory: Memory, number: u32, count: Value, kind: Reduction, into: Var) {
+    let (none, first) = (e.b.u(0), e.b.u(number * WORKGROUP));
+    let start = neutral(&mut e.b, kind);
+    e.b.set(into, start);
+    let other = e.b.open_loop("other", none, count, 1);
+    let at = e.b.add(first, other);
+    let (so_far, next) = (e.b.get(into), e.b.load(memory, at));
+    let next = combine(&mut e.b, kind, so_far, next);
+    e.b.set(into, next);
+    e.b.close_loop();
 }
 
 fn plan(layout: &mut Layout, region: &Region) -> Result<Plan, LowerError> {

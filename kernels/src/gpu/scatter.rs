@@ -2,10 +2,11 @@
 
 use super::builder::Var;
 use super::channels::is_indexable;
+use super::chunks::{End, finish};
 use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
 use super::memory::{Emit, Position};
-use super::reduce::{End, MAX_CHUNKS, finish};
+use super::reduce::MAX_CHUNKS;
 use super::{Kernel, LowerError};
 use naga::{BinaryOperator as Op, MathFunction as Math};
 use raygrad_compiler::graph::{Axes, Axis, Shape};

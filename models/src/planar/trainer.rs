@@ -9,7 +9,7 @@ use crate::geometry::Transform;
 use crate::pictures::View;
 use crate::run::metrics::{CornerError, Entry, Final, Measured, Metrics};
 use crate::run::{RunFolder, results};
-use crate::training::learner::{device_for, psnr};
+use crate::training::learner::psnr;
 use crate::training::{Learner, Training};
 use crate::warps::{KNOWN_TRUTH, Warp};
 use raygrad_runtime::{Device, ProgramId};
@@ -47,10 +47,8 @@ impl Trainer {
     /// Compiles the programs and fills their inputs.
     pub fn new(settings: &Settings, data: PlanarData, warp: Arc<dyn Warp>, device: Device) -> Result<Trainer, Error> {
         let model = PlanarModel::new(settings, data.grid, warp);
-        let train_step = model.train_step();
-        let mut learner = Learner::new(device_for(&train_step, settings, device)?, &settings.optim)?;
+        let (mut learner, train) = Learner::new(device, settings, &model.train_step())?;
         let (frame_view, full_view) = (View::within(data.grid, FRAME_SIDE), View::full(data.grid));
-        let train = learner.add(&train_step)?;
         let evaluate = learner.add(&model.evaluation())?;
         let frame = learner.add(&model.picture(frame_view.width * frame_view.height))?;
         let full = learner.add(&model.picture(full_view.width * full_view.height))?;

@@ -23,9 +23,16 @@ pub struct Learner {
 }
 
 impl Learner {
-    pub fn new(device: Device, optim: &Optim) -> Result<Learner, Error> {
-        let session = Session::new(device.clone())?;
-        Ok(Learner { session, device, optim: optim.clone(), inputs: BTreeMap::new(), step: 0, stepped: false })
+    /// Compiles a training step for a device, with `run.autotune` for the tiles that run it fastest there.
+    pub fn new(device: Device, settings: &Settings, step: &Step) -> Result<(Learner, ProgramId), Error> {
+        let device = match settings.run.autotune {
+            true => device.clone().tuned(&compile(step, &device.target())?)?,
+            false => device,
+        };
+        let (session, optim) = (Session::new(device.clone())?, settings.optim.clone());
+        let mut learner = Learner { session, device, optim, inputs: BTreeMap::new(), step: 0, stepped: false };
+        let program = learner.add(step)?;
+        Ok((learner, program))
     }
 
     /// Compiles one more program.
@@ -174,14 +181,6 @@ impl Learner {
     /// The device, for people.
     pub fn device_name(&self) -> String {
         self.device.name()
-    }
-}
-
-/// The device for a training step: with `run.autotune`, the tiles that run it fastest.
-pub fn device_for(step: &Step, settings: &Settings, device: Device) -> Result<Device, Error> {
-    match settings.run.autotune {
-        true => Ok(device.clone().tuned(&compile(step, &device.target())?)?),
-        false => Ok(device),
     }
 }
 

@@ -56,48 +56,45 @@ impl Rates {
     }
 }
 
-/// Gradients of a loss, computed with a scale in mixed precision; then also the scale, and a mask that says whether all of
-/// the scaled ones are finite.
+/// Inputs with what they become.
+type Updates = Vec<(Tensor, Tensor)>;
+
+/// What an Adam step makes of some parameters and their moments, from a scaled loss in mixed precision: then also the scale,
+/// and a mask that says whether all gradients were finite. Where they were not, nothing changes.
 #[track_caller]
-fn gradients(loss: &Tensor, wanted: &[&Tensor], precision: Precision) -> (Vec<Tensor>, Option<(LossScale, Tensor)>) {
-    if precision == Precision::F32 {
-        return (grad(loss, wanted), None);
+fn adam(
+    loss: &Tensor,
+    all: &[(&Tensor, &StepScalars)],
+    precision: Precision,
+) -> (Updates, Option<(LossScale, Tensor)>) {
+    let wanted: Vec<&Tensor> = all.iter().map(|(p, _)| *p).collect();
+    let scale = (precision == Precision::Mixed).then(LossScale::new);
+    let gradients = grad(&scale.as_ref().map_or(loss.clone(), |s| s.scaled(loss)), &wanted);
+    let scale = scale.map(|s| (s, LossScale::finite(&gradients)));
+    let mut updates = vec![];
+    for ((parameter, scalars), gradient) in all.iter().zip(&gradients) {
+        let gradient = scale.as_ref().map_or(gradient.clone(), |(s, _)| s.unscaled(gradient));
+        let old = Moments::of(parameter);
+        let (value, new) = Adam::default().update(parameter, &gradient, &old, scalars);
+        updates.extend([((*parameter).clone(), value), (old.m, new.m), (old.v, new.v)]);
     }
-    let scale = LossScale::new();
-    let scaled = grad(&scale.scaled(loss), wanted);
-    let finite = LossScale::finite(&scaled);
-    let gradients = scaled.iter().map(|g| scale.unscaled(g)).collect();
-    (gradients, Some((scale, finite)))
+    if let Some((_, finite)) = &scale {
+        updates.iter_mut().for_each(|(old, new)| *new = finite.select(new, old));
+    }
+    (updates, scale)
 }
 
 /// What an Adam step makes of one parameter and its moments. In mixed precision the loss is scaled as the last training step
 /// would have it.
 #[track_caller]
-pub fn update_of(
-    loss: &Tensor,
-    parameter: &Tensor,
-    scalars: &StepScalars,
-    precision: Precision,
-) -> Vec<(Tensor, Tensor)> {
-    let (gradients, scale) = gradients(loss, &[parameter], precision);
-    let mut updates = adam(parameter, &gradients[0], scalars);
-    if let Some((_, finite)) = scale {
-        updates.iter_mut().for_each(|(old, new)| *new = finite.select(new, old));
-    }
-    updates
-}
-
-#[track_caller]
-fn adam(parameter: &Tensor, gradient: &Tensor, scalars: &StepScalars) -> Vec<(Tensor, Tensor)> {
-    let old = Moments::of(parameter);
-    let (value, new) = Adam::default().update(parameter, gradient, &old, scalars);
-    vec![(parameter.clone(), value), (old.m, new.m), (old.v, new.v)]
+pub fn update_of(loss: &Tensor, parameter: &Tensor, scalars: &StepScalars, precision: Precision) -> Updates {
+    adam(loss, &[(parameter, scalars)], precision).0
 }
 
 /// What an Adam step makes of every trained parameter and its moments; field and warp have learning rates of their own. In
 /// mixed precision the loss is scaled.
 #[track_caller]
-pub fn updates(total: &Tensor, field: &[Parameter], warp: &[Parameter], precision: Precision) -> Vec<(Tensor, Tensor)> {
+pub fn updates(total: &Tensor, field: &[Parameter], warp: &[Parameter], precision: Precision) -> Updates {
     let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
     let scalars = |lr| StepScalars { lr: scalar(lr), bias1: scalar(BIAS1), bias2: scalar(BIAS2) };
     let (of_field, of_warp) = (scalars(LR_FIELD), scalars(LR_WARP));
@@ -105,16 +102,8 @@ pub fn updates(total: &Tensor, field: &[Parameter], warp: &[Parameter], precisio
         .chain(warp.iter().map(|p| (p, &of_warp)))
         .filter_map(|(p, scalars)| p.trained.then_some((&p.tensor, scalars)))
         .collect();
-    let wanted: Vec<&Tensor> = all.iter().map(|(p, _)| *p).collect();
-    let (gradients, scale) = gradients(total, &wanted, precision);
-    let mut updates = vec![];
-    for ((parameter, scalars), gradient) in all.into_iter().zip(&gradients) {
-        updates.extend(adam(parameter, gradient, scalars));
-    }
-    if let Some((scale, finite)) = scale {
-        updates.iter_mut().for_each(|(old, new)| *new = finite.select(new, old));
-        updates.extend(scale.updates(&finite));
-    }
+    let (mut updates, scale) = adam(total, &all, precision);
+    updates.extend(scale.into_iter().flat_map(|(scale, finite)| scale.updates(&finite)));
     updates
 }
 

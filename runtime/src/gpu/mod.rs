@@ -91,9 +91,10 @@ pub struct Adapter {
     pub half: Option<Half>,
 }
 
-impl Adapter {
-    pub fn is_gpu(&self) -> bool {
-        self.kind <= AdapterKind::Virtual
+impl AdapterKind {
+    /// Whether it computes on a GPU, as far as it says.
+    pub fn is_gpu(self) -> bool {
+        self <= AdapterKind::Virtual
     }
 }
 
@@ -258,6 +259,19 @@ fn read<A: Api>(
         if lanes.is_empty() { lanes = found } else { lanes.extend(found) }
     }
     Ok(lanes)
+}
+
+/// What a test needs, unless `RAYGRAD_NO_GPU=1` says that there is none here.
+#[cfg(test)]
+pub(crate) fn expected<T>(opened: Result<T, DeviceError>) -> Option<T> {
+    match opened {
+        Ok(device) => Some(device),
+        Err(e) if std::env::var_os("RAYGRAD_NO_GPU").is_some_and(|v| v == "1") => {
+            println!("skipped, RAYGRAD_NO_GPU is set: {e}");
+            None
+        }
+        Err(e) => panic!("{e}"),
+    }
 }
 
 /// The buffer of an arena.

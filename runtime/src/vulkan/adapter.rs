@@ -50,14 +50,17 @@ impl Gpu {
     pub fn open(index: Option<usize>) -> Result<Gpu, DeviceError> {
         let instance = Instance::new()?;
         let all = physical_devices(&instance);
-        let physical = choose(all, index, |p| describe(&instance, *p).kind)?;
+        let physical = choose(all, index, |p| kind(&properties(&instance, *p)))?;
         Gpu::on(instance, physical)
     }
 
     /// A real GPU, if there is one.
     pub fn auto() -> Option<Gpu> {
-        let best = Gpu::open(None).ok()?;
-        best.adapter.is_gpu().then_some(best)
+        let instance = Instance::new().ok()?;
+        let mut all = physical_devices(&instance);
+        all.retain(|p| kind(&properties(&instance, *p)).is_gpu());
+        let physical = choose(all, None, |p| kind(&properties(&instance, *p))).ok()?;
+        Gpu::on(instance, physical).ok()
     }
 
     fn on(instance: Instance, physical: vk::PhysicalDevice) -> Result<Gpu, DeviceError> {
@@ -280,29 +283,34 @@ fn matrix_side(instance: &Instance, physical: vk::PhysicalDevice) -> Option<u32>
 /// Those that know Vulkan 1.1, which brought SPIR-V 1.3.
 fn physical_devices(instance: &Instance) -> Vec<vk::PhysicalDevice> {
     // SAFETY: handles of this instance.
-    unsafe {
-        let all = instance.raw.enumerate_physical_devices().unwrap_or_default();
-        let knows =
-            |p: &vk::PhysicalDevice| instance.raw.get_physical_device_properties(*p).api_version >= vk::API_VERSION_1_1;
-        all.into_iter().filter(knows).collect()
+    let mut all = unsafe { instance.raw.enumerate_physical_devices() }.unwrap_or_default();
+    all.retain(|p| properties(instance, *p).api_version >= vk::API_VERSION_1_1);
+    all
+}
+
+fn properties(instance: &Instance, physical: vk::PhysicalDevice) -> vk::PhysicalDeviceProperties {
+    // SAFETY: a physical device of this instance.
+    unsafe { instance.raw.get_physical_device_properties(physical) }
+}
+
+fn kind(properties: &vk::PhysicalDeviceProperties) -> AdapterKind {
+    match properties.device_type {
+        vk::PhysicalDeviceType::DISCRETE_GPU => AdapterKind::Dedicated,
+        vk::PhysicalDeviceType::INTEGRATED_GPU => AdapterKind::Integrated,
+        vk::PhysicalDeviceType::VIRTUAL_GPU => AdapterKind::Virtual,
+        vk::PhysicalDeviceType::CPU => AdapterKind::Software,
+        _ => AdapterKind::Unknown,
     }
 }
 
 fn describe(instance: &Instance, physical: vk::PhysicalDevice) -> Adapter {
-    // SAFETY: a physical device of this instance.
-    let properties = unsafe { instance.raw.get_physical_device_properties(physical) };
+    let properties = properties(instance, physical);
     let name = properties.device_name_as_c_str().map_or("unnamed".into(), CStr::to_string_lossy);
     let version = properties.api_version;
     Adapter {
         name: name.into_owned(),
         api: "vulkan",
-        kind: match properties.device_type {
-            vk::PhysicalDeviceType::DISCRETE_GPU => AdapterKind::Dedicated,
-            vk::PhysicalDeviceType::INTEGRATED_GPU => AdapterKind::Integrated,
-            vk::PhysicalDeviceType::VIRTUAL_GPU => AdapterKind::Virtual,
-            vk::PhysicalDeviceType::CPU => AdapterKind::Software,
-            _ => AdapterKind::Unknown,
-        },
+        kind: kind(&properties),
         driver: format!(
             "Vulkan {}.{}.{}",
             vk::api_version_major(version),

@@ -209,14 +209,7 @@ mod tests {
     use super::*;
 
     fn gpu() -> Option<Arc<Gpu>> {
-        match Gpu::open(None) {
-            Ok(gpu) => Some(Arc::new(gpu)),
-            Err(e) if std::env::var_os("RAYGRAD_NO_GPU").is_some_and(|v| v == "1") => {
-                println!("skipped, RAYGRAD_NO_GPU is set: {e}");
-                None
-            }
-            Err(e) => panic!("{e}"),
-        }
+        crate::gpu::expected(Gpu::open(None)).map(Arc::new)
     }
 
     /// More writes than frames, pieces larger than a frame, and all of them in order.

@@ -36,7 +36,7 @@ impl Gpu {
     /// A real GPU, if there is one.
     pub fn auto() -> Option<Gpu> {
         let mut all = adapters();
-        all.retain(|a| describe(a).is_gpu());
+        all.retain(|a| kind(a.get_info().device_type).is_gpu());
         all.sort_by_key(|a| kind(a.get_info().device_type));
         all.iter().find_map(|a| Gpu::on(a).ok())
     }
