@@ -5,6 +5,7 @@ use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::functions::adam::{Adam, Moments, StepScalars};
 use raygrad_compiler::graph::{Axes, Axis, Shape, Tensor};
 use raygrad_compiler::ops::input::Role;
+use raygrad_compiler::ops::pick::concat;
 use raygrad_compiler::reference::{Array, Bindings, evaluate};
 use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Step, compile};
@@ -89,9 +90,49 @@ fn network_outputs(rows: usize, widths: [usize; 4]) -> Outputs {
     [vec![("y", y)], names.into_iter().zip(gradients).collect()].concat()
 }
 
-/// Everything that mixed precision has here: storing halves, and multiplying matrices of them.
+/// So many elements that an invocation takes four: channels by number and by index, values that broadcast, integers, and an
+/// update in place.
+fn elements_four_at_a_time(device: &Device) {
+    let (frame, row) = (Axis::new("frame", 3), Axis::new("row", 22000));
+    let x = Tensor::parameter("x", Shape::new(&[&frame, &row], 2));
+    let code = Tensor::parameter("code", Shape::new(&[&frame], 90));
+    let y = Tensor::data("y", Shape::new(&[&row], 1));
+    let wide = concat([&x, &code, &y]).sin();
+    let mask = x.less_than(&y);
+    let number = Tensor::index(&row).wrapping_add(&Tensor::index(&frame));
+    let outputs =
+        vec![("wide", wide), ("mask", mask.clone()), ("chosen", mask.select(&x, &(&x * &y))), ("number", number)];
+    check(device, outputs, 1e-5, "four elements at a time");
+    let double = Step { outputs: vec![], updates: vec![(x.clone(), &x * 2.0 + &y)] };
+    let mut session = Session::new(device.clone()).unwrap();
+    let id = session.add(compile(&double, &device.target()).unwrap()).unwrap();
+    let values: Vec<f32> = (0..2 * 66000).map(|i| i as f32).collect();
+    session.set("x", &values).unwrap();
+    session.set("y", &vec![1.0; 22000]).unwrap();
+    session.run(id).unwrap();
+    assert!(session.get("x").unwrap() == values.iter().map(|v| 2.0 * v + 1.0).collect::<Vec<_>>());
+}
+
+/// A layer whose values and their neighbours in a concatenation go to memory for the next layer.
+fn concatenations_of_layers(device: &Device) {
+    for (rows, hidden, inputs) in [(400, 64, 7), (333, 68, 5), (333, 65, 5)] {
+        let row = Axis::new("row", rows);
+        let x = Tensor::parameter("x", Shape::new(&[&row], inputs));
+        let w = Tensor::parameter("w", Shape::new(&[], (inputs, hidden)));
+        let v = Tensor::parameter("v", Shape::new(&[], (hidden + inputs, 9)));
+        let y = concat([&x.linear(&w).softplus(1.0), &x]).linear(&v);
+        let up = Tensor::data("up", y.shape().clone());
+        let gradients = grad(&total(&(&y * up)), &[&x, &w, &v]);
+        let outputs = [vec![("y", y)], ["dx", "dw", "dv"].into_iter().zip(gradients).collect()].concat();
+        check(device, outputs, 2e-5, &format!("{inputs} and {hidden} channels of {rows} rows"));
+    }
+}
+
+/// Everything that mixed precision has here: storing halves, and multiplying matrices of them. The drivers that distributions
+/// install have no matrices; newer ones (Mesa 26) and GPUs have.
 fn halves(device: &Device) {
     let Some(half) = device.has_half() else {
+        // Nothing requires halves of a device; those that tests run on anywhere store them.
         println!("skipped: {} has no half precision", device.name());
         return;
     };
@@ -107,7 +148,9 @@ fn halves(device: &Device) {
         // Halves have 11 bits; of hundreds of products, some errors add up.
         let all =
             [(2, 333, 34, 64, false), (2, 4100, 72, 257, false), (3, 100, 70, 40, true), (1, 1027, 257, 65, false)];
-        for (frames, rows, inputs, outputs, per_frame) in all {
+        // With matrices weights of many rows are made halves first, and the tiles are the largest.
+        let many = half.matrices.map(|_| (1, 16388, 36, 136, false));
+        for (frames, rows, inputs, outputs, per_frame) in all.into_iter().chain(many) {
             let (outputs, what) = layer_outputs(frames, rows, inputs, outputs, per_frame);
             check(&device, outputs, 3e-3, &format!("{what}, {half:?}"));
         }
@@ -369,6 +412,8 @@ macro_rules! on_every_backend {
 on_every_backend!(
     layers_of_all_widths,
     halves,
+    elements_four_at_a_time,
+    concatenations_of_layers,
     reductions_of_all_sizes,
     gathers_and_scatters,
     compositing,

@@ -194,7 +194,12 @@ fn five_steps_of_training_in_mixed_precision() {
         }
         let expected = train_reference(&mut planar, 5);
         for gpu in gpus() {
-            let Ok(mixed) = gpu.with_precision(Precision::Mixed) else { continue };
+            if gpu.has_half().is_none() {
+                // Nothing requires halves of a device; those that tests run on anywhere store them.
+                println!("skipped: {} has no half precision", gpu.name());
+                continue;
+            }
+            let mixed = gpu.with_precision(Precision::Mixed).unwrap_or_else(|e| panic!("{e}"));
             let found = train(&mixed, &mut planar, 5);
             let what = format!("{preset}, {:?}", mixed.half());
             assert_close(&what, &planar.bindings, &found, &expected, Tolerance { losses: 1e-2, moved: 0.1 });
