@@ -74,6 +74,27 @@ fn layers_of_all_widths(device: &Device) {
     layer(device, 1, 8205, 130, 40, false);
 }
 
+/// What a layer's kernel combines over all rows itself, of a value that it writes and of one that it does not.
+fn layer_totals(rows: usize, inputs: usize, outputs: usize) -> Outputs {
+    let row = Axis::new("row", rows);
+    let x = Tensor::data("x", Shape::new(&[&row], inputs));
+    let w = Tensor::parameter("w", Shape::new(&[], (inputs, outputs)));
+    let b = Tensor::parameter("b", Shape::new(&[], outputs));
+    let y = x.linear(&w) * (1.0 / inputs as f64) + &b;
+    let wave = y.sin();
+    let mean = wave.sum(&[&row]) * (1.0 / rows as f64);
+    vec![("mean", mean), ("largest", y.max_over(&[&row])), ("wave", wave)]
+}
+
+fn totals_of_layers(device: &Device) {
+    // Narrow layers are summed by kernels of their own, and so are columns that a kernel of their own computes (130).
+    for (rows, inputs, outputs) in
+        [(333, 34, 192), (1027, 20, 100), (4099, 70, 128), (5, 3, 66), (999, 30, 130), (50, 6, 3)]
+    {
+        check(device, layer_totals(rows, inputs, outputs), 2e-5, &format!("totals of {rows}, {inputs} to {outputs}"));
+    }
+}
+
 /// A network's result and all gradients, so that what lies between layers is stored.
 fn network_outputs(rows: usize, widths: [usize; 4]) -> Outputs {
     let row = Axis::new("row", rows);
@@ -115,16 +136,21 @@ fn elements_four_at_a_time(device: &Device) {
 
 /// A layer whose values and their neighbours in a concatenation go to memory for the next layer.
 fn concatenations_of_layers(device: &Device) {
-    for (rows, hidden, inputs) in [(400, 64, 7), (333, 68, 5), (333, 65, 5)] {
+    for (rows, hidden, inputs, relu) in
+        [(400, 64, 7, false), (333, 68, 5, false), (333, 68, 5, true), (333, 65, 5, true)]
+    {
         let row = Axis::new("row", rows);
         let x = Tensor::parameter("x", Shape::new(&[&row], inputs));
         let w = Tensor::parameter("w", Shape::new(&[], (inputs, hidden)));
         let v = Tensor::parameter("v", Shape::new(&[], (hidden + inputs, 9)));
-        let y = concat([&x.linear(&w).softplus(1.0), &x]).linear(&v);
+        let layer = x.linear(&w);
+        // What the gradient of a rectifier needs is read back from the concatenation.
+        let both = if relu { concat([&x, &layer.relu()]) } else { concat([&layer.softplus(1.0), &x]) };
+        let y = both.linear(&v).sin();
         let up = Tensor::data("up", y.shape().clone());
         let gradients = grad(&total(&(&y * up)), &[&x, &w, &v]);
         let outputs = [vec![("y", y)], ["dx", "dw", "dv"].into_iter().zip(gradients).collect()].concat();
-        check(device, outputs, 2e-5, &format!("{inputs} and {hidden} channels of {rows} rows"));
+        check(device, outputs, 2e-5, &format!("{inputs} and {hidden} channels of {rows} rows, relu: {relu}"));
     }
 }
 
@@ -153,6 +179,10 @@ fn halves(device: &Device) {
         for (frames, rows, inputs, outputs, per_frame) in all.into_iter().chain(many) {
             let (outputs, what) = layer_outputs(frames, rows, inputs, outputs, per_frame);
             check(&device, outputs, 3e-3, &format!("{what}, {half:?}"));
+        }
+        for (rows, inputs, outputs) in [(1027, 34, 128), (1600, 40, 300)] {
+            let what = format!("totals of {rows}, {inputs} to {outputs}, {half:?}");
+            check(&device, layer_totals(rows, inputs, outputs), 3e-3, &what);
         }
         for (rows, widths) in [(333, [20, 40, 70, 3]), (4400, [63, 256, 128, 4])] {
             check(&device, network_outputs(rows, widths), 6e-3, &format!("network {widths:?} of {rows}, {half:?}"));
@@ -413,6 +443,7 @@ on_every_backend!(
     layers_of_all_widths,
     halves,
     elements_four_at_a_time,
+    totals_of_layers,
     concatenations_of_layers,
     reductions_of_all_sizes,
     gathers_and_scatters,

@@ -1,8 +1,9 @@
 //! Builds regions from the cuts: walks from what must be stored to what can be loaded.
 
 use super::cuts::{Cuts, Key, view};
+use super::reread::reread;
 use super::store::{Candidate, choose};
-use super::{Target, merge};
+use super::{Target, TargetKind, merge};
 use crate::graph::{Axes, Shape, Tensor};
 use crate::ops::input::Input;
 use crate::ops::{Form, Reduction};
@@ -30,6 +31,8 @@ pub struct Fused {
 
 /// Fuses everything that `roots` need.
 pub fn fuse(roots: &[Tensor], target: Target) -> Fused {
+    let reread = (target.kind == TargetKind::Gpu).then(|| reread(roots));
+    let roots = reread.as_deref().unwrap_or(roots);
     // An input that is a root is read where it lies; a computed identity is a root of its own.
     let computed: Vec<Tensor> = roots.iter().filter(|r| r.input_name().is_none()).cloned().collect();
     let mut builder = Builder {

@@ -8,7 +8,7 @@ use crate::plan::region::Grain;
 use std::collections::{HashMap, HashSet};
 
 /// Channels from which a value counts as wide on a GPU.
-const WIDE: usize = 65;
+pub(super) const WIDE: usize = 65;
 /// Channels from which everything pointwise after a layer belongs to its epilogue; below, only what takes nothing else.
 const EPILOGUE: usize = 16;
 /// Channels from which sums of groups of channels are worth an invocation each.

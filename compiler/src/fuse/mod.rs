@@ -10,12 +10,13 @@
 //!
 //! What a region needs from an earlier region of the same domain is either stored or computed again: the fewest channels
 //! are stored that spare it from computing narrow expensive values again; wide ones are recomputed (see
-//! [`Target::store_channels`]).
+//! [`Target::store_channels`]). On a GPU, parts of a stored concatenation are read back from it (see [`reread`]).
 
 mod build;
 mod cuts;
 mod lines;
 mod merge;
+mod reread;
 mod store;
 
 pub use build::{Fused, Origin, fuse};

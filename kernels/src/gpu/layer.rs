@@ -1,17 +1,21 @@
 //! Layers: rows of channels times a weight matrix, tiled, with the pointwise values after it as the epilogue.
 
 use super::builder::Value;
+use super::channels::runs_of;
 use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
 use super::memory::{Emit, Position, is_run};
 use super::parts::{empty, push_load};
-use super::sums::Four;
+use super::reduce::{self, combine, neutral};
+use super::sums::{Epilogue, Place, Total};
 use super::tile::{Along, Operand, Tile, multiply, split};
 use super::{Kernel, LowerError, elements};
 use naga::MathFunction as Math;
-use raygrad_compiler::graph::Axes;
+use raygrad_compiler::graph::{Axes, Axis, Shape};
+use raygrad_compiler::ops::Reduction;
 use raygrad_compiler::plan::region::{BufferId, InstId, Region, RegionOp, Store, Weights};
 use raygrad_compiler::scalar::DType;
+use std::collections::VecDeque;
 use std::ops::Range;
 
 /// The kernels of a region whose stores all write the layer `linear` or what follows from it channel by channel.
@@ -45,12 +49,16 @@ pub(super) fn kernels(
     }
     for (i, stretch) in stretches.into_iter().enumerate() {
         let name = if several { format!("{name}.{}", i + 1) } else { name.to_string() };
+        let tile = Tile::of(&limits, (rows, stretch.len(), terms), batch_axes.elements());
+        let totals = totals(layout, region, rows.div_ceil(tile.m as usize) * tile.parts() as usize)?;
         let layer = Layer {
             region,
             linear,
+            totals,
+            read_ahead: Layer::epilogue_loads(region, linear),
             weights,
             input: *input,
-            tile: Tile::of(&limits, (rows, stretch.len(), terms), batch_axes.elements()),
+            tile,
             rows: rows as u32,
             terms: terms as u32,
             columns: stretch.start as u32..stretch.end as u32,
@@ -59,6 +67,26 @@ pub(super) fn kernels(
             row_axes: row_axes.clone(),
         };
         all.push(layer.kernel(layout, limits, &name)?);
+        for total in &layer.totals {
+            all.extend(total.finish(layout, limits, &format!("{name}.totals"), region)?);
+        }
+    }
+    Ok(all)
+}
+
+/// Whether a layer's kernel combines what follows from it over all rows: it has one matrix, and all columns in one kernel.
+pub(super) fn has_totals(layout: &Layout, region: &Region, linear: InstId) -> bool {
+    let RegionOp::Linear(weights) = &region.inst(linear).op else { return false };
+    layout.shape(weights.buffer).axes.is_empty() && split(region.inst(linear).channels).len() == 1
+}
+
+/// What a region combines over all rows, with memory for that of each of so many parts.
+fn totals(layout: &mut Layout, region: &Region, parts: usize) -> Result<Vec<RowTotal>, LowerError> {
+    let mut all = vec![];
+    for store in &region.stores {
+        let Store::Reduce { kind, value, buffer } = store else { continue };
+        let shape = Shape::new(&[&Axis::new("part", parts)], region.inst(*value).channels);
+        all.push(RowTotal { kind: *kind, result: *buffer, partials: layout.scratch("partial", shape)? });
     }
     Ok(all)
 }
@@ -88,6 +116,9 @@ fn halved(
 struct Layer<'r> {
     region: &'r Region,
     linear: InstId,
+    /// Loads that the epilogue needs.
+    read_ahead: Vec<InstId>,
+    totals: Vec<RowTotal>,
     weights: Weights,
     input: BufferId,
     tile: Tile,
@@ -100,12 +131,116 @@ struct Layer<'r> {
     row_axes: Axes,
 }
 
+/// Where a workgroup's tile begins.
+#[derive(Clone, Copy)]
+struct First {
+    /// Number of the tile along the rows.
+    tile: Value,
+    row: Value,
+    column: Value,
+    batch: Value,
+}
+
+/// A combination over all rows, of each column, of what follows from a layer.
+struct RowTotal {
+    kind: Reduction,
+    result: BufferId,
+    /// Of parts of tiles.
+    partials: BufferId,
+}
+
+impl RowTotal {
+    /// Combines the parts.
+    fn finish(
+        &self,
+        layout: &mut Layout,
+        limits: Limits,
+        name: &str,
+        region: &Region,
+    ) -> Result<Vec<Kernel>, LowerError> {
+        let domain = layout.shape(self.partials).axes.clone();
+        let mut parts = Region { domain, inner: None, ..empty(region) };
+        let value = push_load(layout, &mut parts, self.partials);
+        parts.stores.push(Store::Reduce { kind: self.kind, value, buffer: self.result });
+        reduce::kernels(layout, limits, name, &parts)
+    }
+}
+
+/// Four rows in an epilogue: the position of the first in the tile, and in the layer.
+struct Rows<'r> {
+    m: Value,
+    row: Value,
+    elements: Vec<Value>,
+    values: Values<'r>,
+    /// Each also clamped to the last.
+    columns: Vec<(Value, Value)>,
+}
+
 /// What a layer's kernel writes of one column at four rows.
 struct Found {
     row: Value,
     column: Value,
     elements: Vec<Value>,
     results: Vec<(BufferId, Value)>,
+}
+
+/// Writes what follows from a layer's sums.
+struct Finish<'l, 'r> {
+    layer: &'l Layer<'r>,
+    first: First,
+    /// What was read for sums that are on their way.
+    read: VecDeque<Vec<Rows<'l>>>,
+}
+
+impl Epilogue for Finish<'_, '_> {
+    fn ahead(&mut self, e: &mut Emit, places: &[Place]) {
+        self.read.push_back(self.layer.read(e, self.first, places));
+    }
+
+    fn sums(&mut self, e: &mut Emit, _: &[Place], sums: &[Value]) -> Vec<Vec<Value>> {
+        let layer = self.layer;
+        let mut sums = sums.iter();
+        let mut all: Vec<Found> = vec![];
+        let mut combined = vec![vec![]; layer.totals.len()];
+        for Rows { row, elements, mut values, columns, .. } in self.read.pop_front().unwrap_or_default() {
+            for ((column, clamped), sums) in columns.into_iter().zip(sums.by_ref()) {
+                values.give(e, layer.linear, Channel::Var(clamped), *sums);
+                if layer.layer_columns == 1 {
+                    values.give(e, layer.linear, Channel::At(0), *sums);
+                }
+                let mut results = vec![];
+                for store in &layer.region.stores {
+                    let value = values.channel(e, store.values()[0], Channel::Var(clamped));
+                    match layer.totals.iter().position(|t| t.result == store.buffer()) {
+                        Some(which) => combined[which].push(layer.combined(e, layer.totals[which].kind, row, value)),
+                        None => results.push((store.buffer(), value)),
+                    }
+                }
+                all.push(Found { row, column, results, elements: elements.clone() });
+            }
+        }
+        for found in &all {
+            let end = (!layer.whole_columns()).then_some(layer.columns.end);
+            e.if_below(found.column, end, |e| layer.write(e, found));
+        }
+        combined
+    }
+
+    fn kinds(&self) -> Vec<Reduction> {
+        self.layer.totals.iter().map(|t| t.kind).collect()
+    }
+
+    fn total(&mut self, e: &mut Emit, which: usize, Total { n, part, value }: Total) {
+        let column = e.b.add(self.first.column, n);
+        let end = (!self.layer.whole_columns()).then_some(self.layer.columns.end);
+        e.if_below(column, end, |e| {
+            let parts = e.b.u(self.layer.tile.parts());
+            let before = e.b.mul(self.first.tile, parts);
+            let part = e.b.add(before, part);
+            let at = e.index(self.layer.totals[which].partials, column, part);
+            e.store(self.layer.totals[which].partials, at, value);
+        });
+    }
 }
 
 impl Layer<'_> {
@@ -131,58 +266,98 @@ impl Layer<'_> {
         e.b.name(first_column, "first_column");
         e.b.name(batch, "batch");
 
-        let (from, to) = (e.b.u(0), e.b.u(self.terms));
+        let terms = (e.b.u(0), e.b.u(self.terms));
         let along = if self.weights.transposed { Along::K } else { Along::Edge };
+        let first = First { tile: row_tile, row: first_row, column: first_column, batch };
         multiply(
             &mut e,
             tile,
-            (from, to),
+            terms,
             Operand { along: Along::Edge, load: &mut |e, k, at| self.input_vector(e, batch, first_row, k, at) },
             Operand { along, load: &mut |e, k, at| self.weight_vector(e, batch, first_column, k, at) },
-            &mut |e, sums| self.finish(e, batch, first_row, first_column, sums),
+            &mut Finish { layer: self, first, read: VecDeque::new() },
         );
         e.finish(name)
     }
 
-    /// Writes what follows from some sums.
-    fn finish(&self, e: &mut Emit, batch: Value, first_row: Value, first_column: Value, sums: &[Four]) {
-        let whole = (self.columns.end - self.columns.start).is_multiple_of(self.tile.n);
-        let mut all: Vec<Found> = vec![];
-        let mut rows: Option<(Value, Value, Vec<Value>, Values)> = None;
-        for four in sums {
+    /// What the epilogue computes at some places, with what it needs from memory.
+    fn read<'l>(&'l self, e: &mut Emit, first: First, places: &[Place]) -> Vec<Rows<'l>> {
+        let mut all: Vec<Rows> = vec![];
+        for place in places {
+            let column = e.b.add(first.column, place.n);
+            e.b.name(column, "column");
             // Sums of the same rows share what they compute of those.
-            let (_, row, elements, values) = match &mut rows {
-                Some(known) if known.0 == four.m => known,
-                other => {
-                    let row = e.b.add(first_row, four.m);
-                    e.b.name(row, "row");
-                    let positions = self.positions(e, batch, row);
-                    let elements = positions.iter().map(|p| p.element(e, &self.region.domain)).collect();
-                    let mut values = Values::new(self.region, positions);
-                    if self.in_fours() {
-                        values = values.side_by_side(&self.row_axes);
-                    }
-                    other.insert((four.m, row, elements, values))
+            if all.last().is_none_or(|rows| rows.m != place.m) {
+                let row = e.b.add(first.row, place.m);
+                e.b.name(row, "row");
+                let positions = self.positions(e, first.batch, row);
+                let elements = positions.iter().map(|p| p.element(e, &self.region.domain)).collect();
+                let mut values = Values::new(self.region, positions);
+                if self.in_fours() {
+                    values = values.side_by_side(&self.row_axes);
                 }
-            };
-            let own = e.b.add(first_column, four.n);
-            e.b.name(own, "column");
-            let mut column = own;
-            if !whole {
+                all.push(Rows { m: place.m, row, elements, values, columns: vec![] });
+            }
+            let mut clamped = column;
+            if !self.whole_columns() {
                 let last = e.b.u(self.columns.end - 1);
-                column = e.b.math(Math::Min, &[own, last]);
+                clamped = e.b.math(Math::Min, &[column, last]);
             }
-            values.give(e, self.linear, Channel::Var(column), four.sums);
-            if self.layer_columns == 1 {
-                values.give(e, self.linear, Channel::At(0), four.sums);
+            if let Some(rows) = all.last_mut() {
+                for id in &self.read_ahead {
+                    rows.values.channel(e, *id, Channel::Var(clamped));
+                }
+                rows.columns.push((column, clamped));
             }
-            let stores = self.region.stores.iter();
-            let results = stores.map(|s| (s.buffer(), values.channel(e, s.values()[0], Channel::Var(column))));
-            all.push(Found { row: *row, column: own, elements: elements.clone(), results: results.collect() });
         }
-        for found in &all {
-            e.if_below(found.column, (!whole).then_some(self.columns.end), |e| self.write(e, found));
+        all
+    }
+
+    /// Loads of the region that its values after the layer use channel by channel.
+    fn epilogue_loads(region: &Region, linear: InstId) -> Vec<InstId> {
+        let mut needed = vec![false; region.body.len()];
+        region.stores.iter().flat_map(|s| s.values()).for_each(|v| needed[v.0 as usize] = true);
+        let mut loads = vec![];
+        for at in (0..region.body.len()).rev().filter(|at| InstId(*at as u32) != linear) {
+            let inst = &region.body[at];
+            match inst.op {
+                RegionOp::Load(_) if needed[at] => loads.push(InstId(at as u32)),
+                // A part of a buffer.
+                RegionOp::Pick(_)
+                    if needed[at]
+                        && runs_of(&inst.op).len() == 1
+                        && inst.inputs.iter().all(|i| matches!(region.inst(*i).op, RegionOp::Load(_))) =>
+                {
+                    loads.push(InstId(at as u32))
+                }
+                RegionOp::Map(_) if needed[at] => inst.inputs.iter().for_each(|i| needed[i.0 as usize] = true),
+                _ => {}
+            }
         }
+        loads.reverse();
+        loads
+    }
+
+    fn whole_columns(&self) -> bool {
+        (self.columns.end - self.columns.start).is_multiple_of(self.tile.n)
+    }
+
+    /// Four rows' values as one; rows past the end do not count.
+    fn combined(&self, e: &mut Emit, kind: Reduction, row: Value, value: Value) -> Value {
+        let end = e.b.u(self.rows);
+        let nothing = neutral(&mut e.b, kind);
+        let mut total: Option<Value> = None;
+        for lane in 0..4 {
+            let mut own = if value.vector { e.b.component(value, lane) } else { value };
+            if !self.rows.is_multiple_of(self.tile.m) {
+                let offset = e.b.u(lane);
+                let number = e.b.add(row, offset);
+                let inside = e.b.less(number, end);
+                own = e.b.select(inside, own, nothing);
+            }
+            total = Some(total.map_or(own, |so_far| combine(&mut e.b, kind, so_far, own)));
+        }
+        total.unwrap_or(nothing)
     }
 
     /// Whether four neighbouring rows from a multiple of four on all exist or all do not.

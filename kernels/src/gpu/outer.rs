@@ -5,6 +5,7 @@ use super::builder::Value;
 use super::chunks::{End, finish};
 use super::layout::{Layout, Limits};
 use super::memory::{Emit, Position, is_run};
+use super::sums::Place;
 use super::tile::{Along, Operand, Tile, multiply, split};
 use super::{Kernel, LowerError};
 use naga::MathFunction as Math;
@@ -164,12 +165,12 @@ impl Outer {
                 along: Along::K,
                 load: &mut |e, k, at| self.rows(e, (&part.n, tile.n, tile.k), keep, first_n, k, at, false),
             },
-            &mut |e, sums| {
-                for four in sums {
-                    let (m, n) = (e.b.add(first_m, four.m), e.b.add(first_n, four.n));
+            &mut |e: &mut Emit, places: &[Place], sums: &[Value]| {
+                for (place, sums) in places.iter().zip(sums) {
+                    let (m, n) = (e.b.add(first_m, place.m), e.b.add(first_n, place.n));
                     let guarded = !part.n.channels.len().is_multiple_of(tile.n as usize);
                     let end = guarded.then_some(part.n.channels.end as u32);
-                    e.if_below(n, end, |e| self.write(e, part, (m, n), four.sums, (keep, chunk_first)));
+                    e.if_below(n, end, |e| self.write(e, part, (m, n), *sums, (keep, chunk_first)));
                 }
             },
         );

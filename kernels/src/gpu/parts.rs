@@ -115,12 +115,14 @@ impl Split<'_, '_> {
             self.slice_concatenations(&others);
         }
         let homes = Homes::of(&self.region);
-        let mut on_lines = vec![];
+        let (mut on_lines, mut in_layers) = (vec![], vec![]);
         let mut recomputed: Vec<Store> = vec![];
         let mut reloaded: Vec<Store> = vec![];
         for store in others {
             if self.region.whole && self.is_along_lines(&store) {
                 on_lines.push(store);
+            } else if self.is_layers_total(&homes, &store) {
+                in_layers.push(store);
             } else if self.region.whole || self.must_reload(&store, &homes) {
                 reloaded.push(store);
             } else {
@@ -139,7 +141,7 @@ impl Split<'_, '_> {
             let find = |v: InstId| values.iter().find(|x| x.0 == v).map_or(v, |x| x.1);
             late_region.stores.push(store.map_values(find));
         }
-        self.write(&homes, on_lines)?;
+        self.write(&homes, on_lines, in_layers)?;
         let late = std::mem::replace(&mut self.region, late_region);
         let stores = std::mem::take(&mut self.region.stores);
         let before = self.sums.len();
@@ -204,6 +206,18 @@ impl Split<'_, '_> {
         let inner = Axes::new(self.region.inner.clone());
         matches!(store, Store::Reduce { buffer, .. }
             if self.layout.shape(*buffer).axes == self.region.domain.minus(&inner))
+    }
+
+    /// Reductions over the whole domain of what a layer's kernel computes.
+    fn is_layers_total(&self, homes: &Homes, store: &Store) -> bool {
+        let Store::Reduce { value, buffer, .. } = store else { return false };
+        let home = homes.home[value.0 as usize].map(|level| homes.layers[level]);
+        self.layout.shape(*buffer).axes.is_empty()
+            && self.region.inst(*value).axes == self.region.domain
+            && home.is_some_and(|linear| {
+                self.region.inst(linear).channels == self.region.inst(*value).channels
+                    && layer::has_totals(self.layout, &self.region, linear)
+            })
     }
 
     /// Whether a combined value is better read back than computed by the kernel that combines it.
@@ -319,8 +333,8 @@ impl Split<'_, '_> {
         push_load(self.layout, region, buffer)
     }
 
-    /// Parts for values written element by element, and for reductions along a scan's lines.
-    fn write(&mut self, homes: &Homes, on_lines: Vec<Store>) -> Result<(), LowerError> {
+    /// Parts for values written element by element, and for reductions along a scan's lines or of what layers compute.
+    fn write(&mut self, homes: &Homes, on_lines: Vec<Store>, in_layers: Vec<Store>) -> Result<(), LowerError> {
         if self.region.whole {
             let mut region = self.region.clone();
             region.stores.extend(on_lines);
@@ -337,7 +351,8 @@ impl Split<'_, '_> {
                 cut.push((id, self.materialize(id, product)?));
             }
         }
-        let stores = std::mem::take(&mut self.region.stores);
+        let mut stores = std::mem::take(&mut self.region.stores);
+        stores.extend(in_layers);
         let home = |s: &Store| homes.home.get(s.values()[0].0 as usize).copied().flatten();
         for (level, linear) in homes.layers.iter().enumerate() {
             let own: Vec<Store> = stores.iter().filter(|s| home(s) == Some(level)).cloned().collect();

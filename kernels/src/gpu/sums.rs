@@ -1,21 +1,95 @@
 //! What a tile of a matrix product accumulates: blocks in variables, or cooperative matrices.
 
-use super::builder::{Factor, Kind, MatrixAt, MatrixSum, Value, Var};
+use super::builder::{Factor, Kind, MatrixAt, MatrixSum, Memory, Value, Var};
 use super::half::Matrices;
 use super::memory::Emit;
+use super::reduce::{combine, neutral};
 use super::tile::{Staged, Tile};
 use naga::BuiltIn;
+use raygrad_compiler::ops::Reduction;
 
-/// Sums of four neighbouring m of one n: the positions in the tile of the first m and of n.
-pub(super) struct Four {
+/// Where in the tile sums of four neighbouring m of one n are: the first m, and n.
+#[derive(Clone, Copy)]
+pub(super) struct Place {
     pub m: Value,
     pub n: Value,
-    pub sums: Value,
 }
 
-/// Takes some of the sums. What they need from memory should be read before any of them is written: a device waits for
-/// every read that follows a write.
-pub(super) type UseSums<'a> = &'a mut dyn FnMut(&mut Emit, &[Four]);
+/// Takes the sums, some at a time. What they need from memory should be read ahead, and in any case before any of them is
+/// written: a device waits for every read that follows a write.
+pub(super) trait Epilogue {
+    /// Reads what the sums at the next places need. Called while those before are on their way.
+    fn ahead(&mut self, _: &mut Emit, _: &[Place]) {}
+
+    /// Uses the sums at some places, those of the least recent call of `ahead` that was not answered. Returns what it wants
+    /// to be combined over m: for each of `kinds`, one value a place.
+    fn sums(&mut self, e: &mut Emit, places: &[Place], sums: &[Value]) -> Vec<Vec<Value>>;
+
+    /// How values are combined over m.
+    fn kinds(&self) -> Vec<Reduction> {
+        vec![]
+    }
+
+    /// Takes the values of the kind with a number, combined over a part of the tile's m, of which there are [`Tile::parts`].
+    fn total(&mut self, _: &mut Emit, _: usize, _: Total) {}
+}
+
+/// Values of one n combined over part number `part` of the tile's m.
+pub(super) struct Total {
+    pub n: Value,
+    pub part: Value,
+    pub value: Value,
+}
+
+impl<F: FnMut(&mut Emit, &[Place], &[Value])> Epilogue for F {
+    fn sums(&mut self, e: &mut Emit, places: &[Place], sums: &[Value]) -> Vec<Vec<Value>> {
+        self(e, places, sums);
+        vec![]
+    }
+}
+
+/// Totals that an invocation keeps: of each kind, one a place.
+struct Totals(Vec<(Reduction, Vec<Var>)>);
+
+impl Totals {
+    fn new(e: &mut Emit, kinds: &[Reduction], places: usize) -> Totals {
+        let each = |kind: &Reduction| {
+            let first = neutral(&mut e.b, *kind);
+            (*kind, (0..places).map(|_| e.b.var("total", first)).collect())
+        };
+        Totals(kinds.iter().map(each).collect())
+    }
+
+    fn add(&self, e: &mut Emit, values: &[Vec<Value>]) {
+        for ((kind, totals), values) in self.0.iter().zip(values) {
+            for (total, value) in totals.iter().zip(values) {
+                let before = e.b.get(*total);
+                let after = combine(&mut e.b, *kind, before, *value);
+                e.b.set(*total, after);
+            }
+        }
+    }
+
+    /// Begins anew.
+    fn clear(&self, e: &mut Emit) {
+        for (kind, totals) in &self.0 {
+            let first = neutral(&mut e.b, *kind);
+            totals.iter().for_each(|t| e.b.set(*t, first));
+        }
+    }
+}
+
+/// `count` lanes of a memory from `first` on, combined in order.
+fn combined(e: &mut Emit, kind: Reduction, memory: Memory, first: Value, count: u32) -> Value {
+    let mut total = e.b.load_lane(memory, first);
+    for i in 1..count {
+        let offset = e.b.u(i);
+        let at = e.b.add(first, offset);
+        let next = e.b.load_lane(memory, at);
+        total = combine(&mut e.b, kind, total, next);
+    }
+    total
+}
 
 /// What is accumulated.
 pub(super) enum Sums {
@@ -127,19 +201,48 @@ impl Sums {
     }
 
     /// Hands the sums out.
-    pub fn give(&self, e: &mut Emit, tile: Tile, use_sums: UseSums) {
+    pub fn give(&self, e: &mut Emit, tile: Tile, epilogue: &mut dyn Epilogue) {
         match self {
             Sums::Block { sums, column, row } => {
                 let across = tile.m / tile.own_m;
                 let down = tile.n / tile.own_n;
+                let kinds = epilogue.kinds();
+                let totals = Totals::new(e, &kinds, tile.own_n as usize);
+                let own_n: Vec<Value> = (0..tile.own_n).map(|j| place(e, *row, j / 4 * down, j % 4)).collect();
                 for i in 0..tile.own_m / 4 {
                     let m = place(e, *column, i * across, 0);
-                    let mut found = vec![];
-                    for j in 0..tile.own_n {
-                        let n = place(e, *row, j / 4 * down, j % 4);
-                        found.push(Four { m, n, sums: e.b.get(sums[j as usize][i as usize]) });
+                    let (mut places, mut found) = (vec![], vec![]);
+                    for (n, sums) in own_n.iter().zip(sums) {
+                        places.push(Place { m, n: *n });
+                        found.push(e.b.get(sums[i as usize]));
                     }
-                    use_sums(e, &found);
+                    epilogue.ahead(e, &places);
+                    let values = epilogue.sums(e, &places, &found);
+                    totals.add(e, &values);
+                }
+                // Through workgroup memory, one kind after the other: invocations of the same columns are `across`.
+                if kinds.is_empty() {
+                    return;
+                }
+                let memory = e.b.workgroup("columns", Kind::F32, false, tile.n * across);
+                for (which, (kind, totals)) in totals.0.iter().enumerate() {
+                    if which > 0 {
+                        e.b.barrier();
+                    }
+                    let across_value = e.b.u(across);
+                    for (n, total) in own_n.iter().zip(totals) {
+                        let at = e.b.mul(*n, across_value);
+                        let at = e.b.add(at, *column);
+                        let value = e.b.get(*total);
+                        e.b.store(memory, at, value);
+                    }
+                    e.b.barrier();
+                    let (n, part) = (e.invocation, e.b.u(0));
+                    e.if_below(n, Some(tile.n), |e| {
+                        let first = e.b.mul(n, across_value);
+                        let value = combined(e, *kind, memory, first, across);
+                        epilogue.total(e, which, Total { n, part, value });
+                    });
                 }
             }
             Sums::Matrices { sums, first_m, first_n, subgroup, sizes } => {
@@ -154,35 +257,101 @@ impl Sums {
                 let own_first = e.b.mul(*subgroup, own);
                 let count = e.b.u(sizes.subgroup);
                 let lane = e.b.rem(e.invocation, count);
-                for (j, sums) in sums.iter().enumerate() {
-                    for (i, sums) in sums.chunks((strip / side) as usize).enumerate() {
-                        e.b.barrier();
-                        for (i, sum) in sums.iter().enumerate() {
-                            let offset = e.b.u(i as u32 * side / 4);
-                            let first = e.b.add(own_first, offset);
-                            e.b.matrix_store(*sum, MatrixAt { memory, first, line, row_major: false });
+                // Vectors of four m and columns that this invocation takes, where lanes are vectors of columns.
+                let vectors = strip / 4;
+                let mut mine = vec![];
+                for done in (0..vectors * side).step_by(sizes.subgroup as usize) {
+                    let vectors_value = e.b.u(vectors);
+                    let number = match sizes.subgroup.is_multiple_of(vectors) {
+                        true => lane,
+                        false => {
+                            let done = e.b.u(done);
+                            e.b.add(lane, done)
                         }
-                        e.b.barrier();
-                        let mut found = vec![];
-                        for done in (0..strip / 4 * side).step_by(sizes.subgroup as usize) {
-                            let offset = e.b.u(done);
-                            let number = e.b.add(lane, offset);
-                            let (down, four) = (e.b.u(strip / 4), e.b.u(4));
-                            let (vector, column) = (e.b.rem(number, down), e.b.div(number, down));
-                            let (own_m, before_m) = (e.b.mul(vector, four), e.b.u(i as u32 * strip));
-                            let m = e.b.add(*first_m, before_m);
-                            let m = e.b.add(m, own_m);
-                            let before_n = e.b.u(j as u32 * side);
-                            let n = e.b.add(*first_n, before_n);
-                            let n = e.b.add(n, column);
-                            let line = e.b.u(line);
-                            let at = e.b.mul(column, line);
-                            let at = e.b.add(at, vector);
-                            let at = e.b.add(at, own_first);
-                            found.push(Four { m, n, sums: e.b.load(memory, at) });
-                        }
-                        use_sums(e, &found);
+                    };
+                    let (vector, mut column) = (e.b.rem(number, vectors_value), e.b.div(number, vectors_value));
+                    if number == lane {
+                        let before = e.b.u(done / vectors);
+                        column = e.b.add(column, before);
                     }
+                    mine.push((vector, column));
+                }
+                let rounds: Vec<(usize, usize)> = (0..sums.len())
+                    .flat_map(|j| (0..sums[0].len().div_ceil((strip / side) as usize)).map(move |i| (j, i)))
+                    .collect();
+                let places = |e: &mut Emit, (j, i): (usize, usize)| {
+                    let (before_m, before_n) = (e.b.u(i as u32 * strip), e.b.u(j as u32 * side));
+                    let (m, n) = (e.b.add(*first_m, before_m), e.b.add(*first_n, before_n));
+                    let four = e.b.u(4);
+                    let mut all = vec![];
+                    for (vector, column) in &mine {
+                        let own = e.b.mul(*vector, four);
+                        all.push(Place { m: e.b.add(m, own), n: e.b.add(n, *column) });
+                    }
+                    all
+                };
+                let strips = rounds.len() / sums.len();
+                let kinds = epilogue.kinds();
+                let totals = Totals::new(e, &kinds, mine.len());
+                let mut next = places(e, rounds[0]);
+                epilogue.ahead(e, &next);
+                for (round, (j, i)) in rounds.iter().enumerate() {
+                    e.b.barrier();
+                    let here = sums[*j].chunks((strip / side) as usize).skip(*i).take(1);
+                    for (i, sum) in here.flatten().enumerate() {
+                        let offset = e.b.u(i as u32 * side / 4);
+                        let first = e.b.add(own_first, offset);
+                        e.b.matrix_store(*sum, MatrixAt { memory, first, line, row_major: false });
+                    }
+                    e.b.barrier();
+                    let mut found = vec![];
+                    for (vector, column) in &mine {
+                        let line = e.b.u(line);
+                        let at = e.b.mul(*column, line);
+                        let at = e.b.add(at, *vector);
+                        let at = e.b.add(at, own_first);
+                        found.push(e.b.load(memory, at));
+                    }
+                    let here = next.clone();
+                    if let Some(after) = rounds.get(round + 1) {
+                        next = places(e, *after);
+                        epilogue.ahead(e, &next);
+                    }
+                    let values = epilogue.sums(e, &here, &found);
+                    totals.add(e, &values);
+                    if i + 1 < strips {
+                        continue;
+                    }
+                    // The columns are through: their totals pass through the same memory.
+                    for (which, (kind, totals)) in totals.0.iter().enumerate() {
+                        let (four, line_value) = (e.b.u(4), e.b.u(4 * line));
+                        let own_first = e.b.mul(own_first, four);
+                        e.b.barrier();
+                        for ((vector, column), total) in mine.iter().zip(totals) {
+                            let at = e.b.mul(*column, line_value);
+                            let at = e.b.add(at, *vector);
+                            let at = e.b.add(at, own_first);
+                            let value = e.b.get(*total);
+                            e.b.store_lane(memory, at, value);
+                        }
+                        e.b.barrier();
+                        let (across, own_m) = (e.b.u(tile.m / tile.own_m), e.b.u(tile.own_m));
+                        let part = e.b.div(*first_m, own_m);
+                        let part = e.b.rem(part, across);
+                        for done in (0..side).step_by(sizes.subgroup as usize) {
+                            let (done, before) = (e.b.u(done), e.b.u(*j as u32 * side));
+                            let column = e.b.add(lane, done);
+                            e.if_below(column, Some(side), |e| {
+                                let first = e.b.mul(column, line_value);
+                                let first = e.b.add(first, own_first);
+                                let value = combined(e, *kind, memory, first, vectors);
+                                let n = e.b.add(*first_n, before);
+                                let n = e.b.add(n, column);
+                                epilogue.total(e, which, Total { n, part, value });
+                            });
+                        }
+                    }
+                    totals.clear(e);
                 }
             }
         }

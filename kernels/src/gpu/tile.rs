@@ -9,7 +9,7 @@ use super::builder::{Factor, Kind, MatrixAt, Memory, Value, Var};
 use super::half::Matrices;
 use super::layout::Limits;
 use super::memory::Emit;
-use super::sums::{Sums, UseSums};
+use super::sums::{Epilogue, Sums};
 
 /// Workgroups that keep a device busy.
 const ENOUGH: u64 = 128;
@@ -96,6 +96,11 @@ impl Tile {
         self.own_m.min(2 * side)
     }
 
+    /// Parts of the tile's m over which values are combined.
+    pub fn parts(&self) -> u32 {
+        if self.matrices.is_some() { self.m / self.own_m } else { 1 }
+    }
+
     pub fn invocations(&self) -> u32 {
         (self.m / self.own_m) * (self.n / self.own_n) * self.matrices.map_or(1, |m| m.subgroup)
     }
@@ -125,15 +130,15 @@ pub(super) struct Operand<'a> {
     pub load: &'a mut dyn FnMut(&mut Emit, Value, Value) -> Value,
 }
 
-/// Emits the product over `from..to` of k, and calls `use_sums` until all of the tile is given. Terms beyond `to` must come
-/// as zeros from `a`.
+/// Emits the product over `from..to` of k, and gives all of the tile's sums to `epilogue`. Terms beyond `to` must come as zeros
+/// from `a`.
 pub(super) fn multiply(
     e: &mut Emit,
     tile: Tile,
     (from, to): (Value, Value),
     a: Operand,
     b: Operand,
-    use_sums: UseSums,
+    epilogue: &mut dyn Epilogue,
 ) {
     let mut a = Staged::new(e, tile, "tile_a", tile.m, a);
     let mut b = Staged::new(e, tile, "tile_b", tile.n, b);
@@ -155,7 +160,7 @@ pub(super) fn multiply(
     e.b.close_if();
     sums.accumulate(e, tile, &a, &b);
     e.b.close_loop();
-    sums.give(e, tile, use_sums);
+    sums.give(e, tile, epilogue);
 }
 
 /// An operand's way through workgroup memory.
