@@ -3,9 +3,9 @@
 
 use super::builder::Value;
 use super::chunks::{End, finish};
+use super::give::Place;
 use super::layout::{Layout, Limits};
 use super::memory::{Emit, Position, is_run};
-use super::sums::Place;
 use super::tile::{Along, Operand, Tile, multiply, split};
 use super::{Kernel, LowerError};
 use naga::MathFunction as Math;

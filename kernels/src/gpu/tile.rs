@@ -6,10 +6,11 @@
 //! come out four `m` at a time. Channel-major buffers make this one kernel for layers and for weight gradients.
 
 use super::builder::{Factor, Kind, MatrixAt, Memory, Value, Var};
+use super::give::Epilogue;
 use super::half::Matrices;
 use super::layout::Limits;
 use super::memory::Emit;
-use super::sums::{Epilogue, Sums};
+use super::sums::Sums;
 
 /// Workgroups that keep a device busy.
 const ENOUGH: u64 = 128;
