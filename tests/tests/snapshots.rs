@@ -97,10 +97,13 @@ mod wgsl {
     fn kernels_of_halves() {
         let row = Axis::new("row", 1200);
         let x = Tensor::data("x", Shape::new(&[&row], 40));
-        let w = Tensor::parameter("w", Shape::new(&[], (40, 70)));
-        let y = (x.linear(&w) + Tensor::parameter("b", Shape::new(&[], 70))).relu();
+        let w = Tensor::parameter("w", Shape::new(&[], (40, 100)));
+        let b = Tensor::parameter("b", Shape::new(&[], 100));
+        let y = (x.linear(&w) + &b).relu();
         let loss = (&y * &y).sum_channels().sum(&[&row]);
-        let step = Step { outputs: vec![("dw".into(), grad(&loss, &[&w]).remove(0))], updates: vec![] };
+        let gradients = grad(&loss, &[&w, &b]);
+        let step =
+            Step { outputs: ["dw", "db"].map(str::to_string).into_iter().zip(gradients).collect(), updates: vec![] };
         for (name, matrices) in [("halves", None), ("matrices", Some(Matrices { side: 16, subgroup: 32 }))] {
             let limits = Limits { half: Some(Half { matrices }), max_workgroup_bytes: 48 << 10, ..Limits::default() };
             snapshot(&format!("wgsl-{name}"), &kernels_within(&step, &limits));
