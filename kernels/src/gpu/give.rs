@@ -118,6 +118,7 @@ pub(super) fn give_blocks(
         return;
     }
     // Of each n, `across` invocations have a total.
+    e.b.topic("column");
     let memory = e.b.workgroup("columns", Kind::F32, false, tile.n * across);
     for (which, (kind, totals)) in totals.0.iter().enumerate() {
         if which > 0 {
@@ -216,7 +217,9 @@ impl Strips {
             if i + 1 == strips {
                 // These columns are through.
                 self.total(e, tile, *j, first, &totals, epilogue);
-                totals.clear(e);
+                if j + 1 < sums.len() {
+                    totals.clear(e);
+                }
             }
         }
     }
@@ -265,6 +268,7 @@ impl Strips {
         totals: &Totals,
         epilogue: &mut dyn Epilogue,
     ) {
+        e.b.topic("column");
         let side = self.sizes.side;
         for (which, (kind, totals)) in totals.0.iter().enumerate() {
             let (four, line) = (e.b.u(4), e.b.u(4 * self.line));
