@@ -7,6 +7,7 @@
 use super::cuts::{WIDE, resolve};
 use crate::graph::{Tensor, topological, with_source};
 use crate::ops::Form;
+use crate::ops::pick::runs;
 use std::collections::{HashMap, HashSet};
 
 /// The same roots, with pointwise values that only what follows a stored concatenation needs computed from it.
@@ -23,27 +24,39 @@ pub(super) fn reread(roots: &[Tensor]) -> Vec<Tensor> {
     let read_by_layers: HashSet<u64> = layers.map(|t| resolve(&t.inputs()[0]).id()).collect();
     for whole in order.iter().filter(|t| t.inputs().len() > 1 && read_by_layers.contains(&t.id())) {
         let Form::Pick(pick) = whole.op().form() else { continue };
+        let parts = parts(whole, &pick);
+        if parts.is_empty() {
+            continue;
+        }
         let after = after(whole, &order);
         let follows = |t: &Tensor| after.contains(&t.id());
-        let mut first = 0;
-        for run in pick.chunk_by(|a, b| (a.0, a.1 + 1) == *b) {
-            let part = &whole.inputs()[run[0].0 as usize];
-            let is_whole = run[0].1 == 0 && run.len() == part.width() && part.axes() == whole.axes();
-            if is_whole && part.width() >= WIDE && part.op().form() != Form::Input {
-                for user in users.get(&part.id()).into_iter().flatten() {
-                    let later = users.get(&user.id()).is_some_and(|all| all.iter().all(|u| follows(u)));
-                    if matches!(user.op().form(), Form::Pointwise(_)) && !is_root(user) && (follows(user) || later) {
-                        replaced.entry((user.id(), part.id())).or_insert((whole.clone(), first));
-                    }
+        for (part, first) in parts {
+            for user in users.get(&part.id()).into_iter().flatten() {
+                let later = users.get(&user.id()).is_some_and(|all| all.iter().all(|u| follows(u)));
+                if matches!(user.op().form(), Form::Pointwise(_)) && !is_root(user) && (follows(user) || later) {
+                    replaced.entry((user.id(), part.id())).or_insert((whole.clone(), first));
                 }
             }
-            first += run.len();
         }
     }
     if replaced.is_empty() {
         return roots.to_vec();
     }
     rebuild(roots, &replaced)
+}
+
+/// Wide computed operands of which a concatenation has all channels in order, with the first of them there.
+fn parts(whole: &Tensor, pick: &[(u32, u32)]) -> Vec<(Tensor, usize)> {
+    let (mut found, mut first) = (vec![], 0);
+    for run in runs(pick) {
+        let part = &whole.inputs()[run[0].0 as usize];
+        let all = run[0].1 == 0 && run.len() == part.width() && part.axes() == whole.axes();
+        if all && part.width() >= WIDE && part.op().form() != Form::Input {
+            found.push((part.clone(), first));
+        }
+        first += run.len();
+    }
+    found
 }
 
 /// What is computed from `t`.
@@ -62,31 +75,25 @@ fn after(t: &Tensor, order: &[Tensor]) -> HashSet<u64> {
 fn rebuild(roots: &[Tensor], replaced: &HashMap<(u64, u64), (Tensor, usize)>) -> Vec<Tensor> {
     let mut done: HashMap<u64, Tensor> = HashMap::new();
     let mut stack: Vec<Tensor> = roots.to_vec();
-    while let Some(t) = stack.last().cloned() {
-        let operand = |i: &Tensor| replaced.get(&(t.id(), i.id())).map_or(i.clone(), |(whole, _)| whole.clone());
-        let missing: Vec<Tensor> = t.inputs().iter().map(operand).filter(|o| !done.contains_key(&o.id())).collect();
-        if done.contains_key(&t.id()) || missing.is_empty() {
-            stack.pop();
-        }
+    while let Some(t) = stack.pop() {
         if done.contains_key(&t.id()) {
             continue;
         }
+        let read = |i: &Tensor| replaced.get(&(t.id(), i.id())).map_or(i.clone(), |(whole, _)| whole.clone());
+        let missing: Vec<Tensor> = t.inputs().iter().map(read).filter(|o| !done.contains_key(&o.id())).collect();
         if !missing.is_empty() {
+            stack.push(t);
             stack.extend(missing);
             continue;
         }
-        let new = with_source(t.source(), || {
-            let operand = |i: &Tensor| match replaced.get(&(t.id(), i.id())) {
-                Some((whole, first)) => {
-                    let channels: Vec<usize> = (*first..first + i.width()).collect();
-                    done[&whole.id()].pick_as(&channels, i.channels())
-                }
-                None => done[&i.id()].clone(),
-            };
-            let inputs: Vec<Tensor> = t.inputs().iter().map(operand).collect();
-            let same = inputs.iter().zip(t.inputs()).all(|(a, b)| a.id() == b.id());
-            if same { t.clone() } else { Tensor::record_arc(t.op().clone(), inputs) }
-        });
+        let operand = |i: &Tensor| match replaced.get(&(t.id(), i.id())) {
+            Some((whole, first)) => {
+                let channels: Vec<usize> = (*first..first + i.width()).collect();
+                with_source(t.source(), || done[&whole.id()].pick_as(&channels, i.channels()))
+            }
+            None => done[&i.id()].clone(),
+        };
+        let new = t.with_inputs(t.inputs().iter().map(operand).collect());
         done.insert(t.id(), new);
     }
     roots.iter().map(|r| done[&r.id()].clone()).collect()

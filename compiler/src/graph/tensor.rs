@@ -69,6 +69,12 @@ impl Tensor {
         Tensor(Arc::new(Node { id, op, inputs, shape, source, error }))
     }
 
+    /// The same op, recorded at the same source line, of other operands; the tensor itself if they are its own.
+    pub(crate) fn with_inputs(&self, inputs: Vec<Tensor>) -> Tensor {
+        let same = inputs.iter().zip(self.inputs()).all(|(a, b)| a.id() == b.id());
+        if same { self.clone() } else { with_source(self.source(), || Tensor::record_arc(self.op().clone(), inputs)) }
+    }
+
     /// A tensor that only carries an error, for derived functions that check their arguments.
     #[track_caller]
     pub fn misfit(

@@ -13,6 +13,11 @@ pub struct Pick {
     pub name: &'static str,
 }
 
+/// The runs of a pick: neighbouring channels of one operand.
+pub fn runs(pick: &[(u32, u32)]) -> impl Iterator<Item = &[(u32, u32)]> {
+    pick.chunk_by(|a, b| (a.0, a.1 + 1) == *b)
+}
+
 impl Op for Pick {
     fn name(&self) -> &'static str {
         self.name

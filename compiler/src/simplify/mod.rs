@@ -49,10 +49,7 @@ impl Pass {
             if self.done.contains_key(&t.id()) {
                 continue;
             }
-            let inputs: Vec<Tensor> = t.inputs().iter().map(|i| self.done[&i.id()].clone()).collect();
-            let same = inputs.iter().zip(t.inputs()).all(|(a, b)| a.id() == b.id());
-            let rebuilt =
-                if same { t.clone() } else { with_source(t.source(), || Tensor::record_arc(t.op().clone(), inputs)) };
+            let rebuilt = t.with_inputs(t.inputs().iter().map(|i| self.done[&i.id()].clone()).collect());
             let simpler = with_source(t.source(), || rules::rewrite(&rebuilt).or_else(|| split::rewrite(&rebuilt)));
             let result = match simpler {
                 Some(s) => {

@@ -8,7 +8,7 @@ use super::layer::Layer;
 use super::layout::{Layout, Limits};
 use super::memory::{Emit, is_run};
 use super::parts::{empty, push_load};
-use super::reduce::{self, combine, neutral};
+use super::reduce::{self, combine_all, neutral};
 use super::{Kernel, LowerError};
 use naga::MathFunction as Math;
 use raygrad_compiler::graph::{Axis, Shape};
@@ -209,7 +209,7 @@ impl Layer<'_> {
     fn combined(&self, e: &mut Emit, kind: Reduction, row: Value, value: Value) -> Value {
         let end = e.b.u(self.rows);
         let nothing = neutral(&mut e.b, kind);
-        let mut total: Option<Value> = None;
+        let mut all = vec![];
         for lane in 0..4 {
             let mut own = if value.vector { e.b.component(value, lane) } else { value };
             if !self.rows.is_multiple_of(self.tile.m) {
@@ -218,9 +218,9 @@ impl Layer<'_> {
                 let inside = e.b.less(number, end);
                 own = e.b.select(inside, own, nothing);
             }
-            total = Some(total.map_or(own, |so_far| combine(&mut e.b, kind, so_far, own)));
+            all.push(own);
         }
-        total.unwrap_or(nothing)
+        combine_all(&mut e.b, kind, &all)
     }
 
     /// Writes the region's values of one column at four rows.

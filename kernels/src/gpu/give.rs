@@ -4,7 +4,7 @@
 use super::builder::{Kind, MatrixAt, MatrixSum, Memory, Value, Var};
 use super::half::Matrices;
 use super::memory::Emit;
-use super::reduce::{combine, neutral};
+use super::reduce::{combine, combine_lanes, neutral};
 use super::tile::Tile;
 use raygrad_compiler::ops::Reduction;
 
@@ -79,18 +79,6 @@ impl Totals {
     }
 }
 
-/// `count` lanes of a memory from `first` on, combined in order.
-fn combined(e: &mut Emit, kind: Reduction, memory: Memory, first: Value, count: u32) -> Value {
-    let mut total = e.b.load_lane(memory, first);
-    for i in 1..count {
-        let offset = e.b.u(i);
-        let at = e.b.add(first, offset);
-        let next = e.b.load_lane(memory, at);
-        total = combine(&mut e.b, kind, total, next);
-    }
-    total
-}
-
 /// Hands out what invocations hold in variables.
 pub(super) fn give_blocks(
     e: &mut Emit,
@@ -135,7 +123,7 @@ pub(super) fn give_blocks(
         let (n, part) = (e.invocation, e.b.u(0));
         e.if_below(n, Some(tile.n), |e| {
             let first = e.b.mul(n, across_value);
-            let value = combined(e, *kind, memory, first, across);
+            let value = combine_lanes(e, *kind, memory, first, (across, 1));
             epilogue.total(e, which, Total { n, part, value });
         });
     }
@@ -282,16 +270,15 @@ impl Strips {
                 e.b.store_lane(self.memory, at, value);
             }
             e.b.barrier();
-            let (parts, own_m) = (e.b.u(tile.parts()), e.b.u(tile.own_m));
+            let own_m = e.b.u(tile.own_m);
             let part = e.b.div(first_m, own_m);
-            let part = e.b.rem(part, parts);
             for done in (0..side).step_by(self.sizes.subgroup as usize) {
                 let (done, before) = (e.b.u(done), e.b.u(j as u32 * side));
                 let column = e.b.add(self.lane, done);
                 e.if_below(column, Some(side), |e| {
                     let own = e.b.mul(column, line);
                     let own = e.b.add(own, first);
-                    let value = combined(e, *kind, self.memory, own, self.vectors);
+                    let value = combine_lanes(e, *kind, self.memory, own, (self.vectors, 1));
                     let n = e.b.add(first_n, before);
                     let n = e.b.add(n, column);
                     epilogue.total(e, which, Total { n, part, value });

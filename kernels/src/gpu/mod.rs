@@ -8,7 +8,7 @@
 //! | `channels`, `eval`, `scalar`, `eigen` | values of a region at a position |
 //! | `parts`, `stages` | a region cut into what one kind of kernel does, and long work into stages |
 //! | `elements`, `reduce`, `chunks`, `scatter`, `scan`, `layer`, `outer` | the kinds of kernels |
-//! | `tile`, `sums` | matrix products in tiles |
+//! | `tile`, `sums`, `give`, `epilogue` | matrix products in tiles, and what is done with their sums |
 //! | `peak` | kernels that measure a device |
 
 mod builder;

@@ -12,6 +12,7 @@ use super::layout::{Layout, Limits};
 use super::{Kernel, LowerError, layer, outer, reduce, scan, scatter, stages};
 use raygrad_compiler::graph::{Axes, Shape};
 use raygrad_compiler::ops::Reduction;
+use raygrad_compiler::ops::pick::runs;
 use raygrad_compiler::plan::Launch;
 use raygrad_compiler::plan::region::{BufferId, Inst, InstId, Region, RegionOp, Store};
 use raygrad_compiler::scalar::DType;
@@ -121,7 +122,7 @@ impl Split<'_, '_> {
         for store in others {
             if self.region.whole && self.is_along_lines(&store) {
                 on_lines.push(store);
-            } else if self.is_layers_total(&homes, &store) {
+            } else if !self.region.whole && self.is_layers_total(&homes, &store) {
                 in_layers.push(store);
             } else if self.region.whole || self.must_reload(&store, &homes) {
                 reloaded.push(store);
@@ -175,7 +176,7 @@ impl Split<'_, '_> {
         if inst.dtype != DType::F32 || self.layout.shape(buffer).axes != self.region.domain {
             return None;
         }
-        let runs: Vec<&[(u32, u32)]> = pick.chunk_by(|a, b| (a.0, a.1 + 1) == *b).collect();
+        let runs: Vec<&[(u32, u32)]> = runs(pick).collect();
         let whole = |run: &[(u32, u32)]| {
             let operand = inst.inputs[run[0].0 as usize];
             (run[0].1 == 0 && run.len() == self.region.inst(operand).channels).then_some(operand)

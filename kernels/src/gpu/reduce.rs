@@ -41,6 +41,29 @@ pub(super) fn combine(b: &mut Builder, kind: Reduction, so_far: Value, next: Val
     }
 }
 
+/// Combines values in order; of none, what combining starts from.
+pub(super) fn combine_all(b: &mut Builder, kind: Reduction, values: &[Value]) -> Value {
+    let Some((first, others)) = values.split_first() else { return neutral(b, kind) };
+    others.iter().fold(*first, |so_far, next| combine(b, kind, so_far, *next))
+}
+
+/// `count` lanes of a memory from `first` on, `every` apart, combined in order.
+pub(super) fn combine_lanes(
+    e: &mut Emit,
+    kind: Reduction,
+    memory: Memory,
+    first: Value,
+    (count, every): (u32, u32),
+) -> Value {
+    let mut all = vec![];
+    for i in 0..count {
+        let offset = e.b.u(i * every);
+        let at = e.b.add(first, offset);
+        all.push(e.b.load_lane(memory, at));
+    }
+    combine_all(&mut e.b, kind, &all)
+}
+
 /// What combining starts from.
 pub(super) fn neutral(b: &mut Builder, kind: Reduction) -> Value {
     match kind {
@@ -244,7 +267,7 @@ impl Reducer<'_> {
             if fours {
                 let lanes = [0, 1, 2, 3].map(|i| e.b.component(value, i));
                 let kind = self.targets[i].kind;
-                value = lanes[1..].iter().fold(lanes[0], |so_far, next| combine(&mut e.b, kind, so_far, *next));
+                value = combine_all(&mut e.b, kind, &lanes);
             }
             let first = e.b.u(i as u32 * WORKGROUP);
             let at = e.b.add(e.invocation, first);
@@ -310,14 +333,7 @@ impl Reducer<'_> {
 
     /// The first values of the eighths of a target's 64, combined in order.
     fn spread(&self, e: &mut Emit, found: Memory, first: Value, kind: Reduction) -> Value {
-        let mut total: Option<Value> = None;
-        for i in 0..EIGHTHS {
-            let offset = e.b.u(i * WORKGROUP / EIGHTHS);
-            let at = e.b.add(first, offset);
-            let next = e.b.load(found, at);
-            total = Some(total.map_or(next, |so_far| combine(&mut e.b, kind, so_far, next)));
-        }
-        total.unwrap_or(first)
+        combine_lanes(e, kind, found, first, (EIGHTHS, WORKGROUP / EIGHTHS))
     }
 
     /// `count` values from `first` on, combined in order.

@@ -84,7 +84,8 @@ impl Tile {
     /// Memory that a workgroup shares.
     fn bytes(&self) -> u32 {
         match self.matrices {
-            None => self.k * (self.m / 4 + 1 + self.n / 4 + 1) * 16,
+            // Staged, and what the columns' totals pass through.
+            None => self.k * (self.m / 4 + 1 + self.n / 4 + 1) * 16 + self.n * (self.m / self.own_m) * 4,
             Some(Matrices { side, subgroup }) => {
                 let staged = (self.m + self.n) * (self.k / 4 + 2) * 8;
                 staged + self.invocations() / subgroup * side * (self.strip(side) / 4 + 1) * 16
