@@ -46,12 +46,14 @@ fn network() -> Program {
     let weight = |name: &str, rows: usize, columns: usize| Tensor::parameter(name, Shape::new(&[], (rows, columns)));
     let all =
         [weight("a", 63, 256), weight("b", 319, 128), weight("c", 128, 20), weight("d", 20, 8), weight("e", 8, 3)];
-    let hidden = x.linear(&all[0]).relu();
-    let wide = concat([&hidden, &x]).linear(&all[1]).relu();
+    let biases = [("bias of a", 256), ("bias of b", 128)].map(|(n, c)| Tensor::parameter(n, Shape::new(&[], c)));
+    let hidden = (x.linear(&all[0]) + &biases[0]).relu();
+    let wide = (concat([&hidden, &x]).linear(&all[1]) + &biases[1]).relu();
     let y = wide.linear(&all[2]).relu().linear(&all[3]).relu().linear(&all[4]);
     let loss = (&y * &y).sum_channels().sum(&[&row]);
-    let gradients = grad(&loss, &all.iter().collect::<Vec<_>>());
-    let outputs = ["a", "b", "c", "d", "e"].iter().map(|n| n.to_string()).zip(gradients).collect();
+    let all: Vec<&Tensor> = all.iter().chain(&biases).collect();
+    let names = all.iter().map(|t| t.input_name().unwrap_or_default().to_string());
+    let outputs = names.zip(grad(&loss, &all)).collect();
     compile(&Step { outputs, updates: vec![] }, &Target::gpu()).unwrap_or_else(|e| panic!("{e}"))
 }
 
@@ -59,6 +61,17 @@ fn network() -> Program {
 fn halves() -> [Half; 3] {
     let matrices = |side, subgroup| Half { matrices: Some(Matrices { side, subgroup }) };
     [Half { matrices: None }, matrices(16, 32), matrices(8, 8)]
+}
+
+/// Tiles are made for matrices of 8 and 16, and for subgroups of which a workgroup holds at least four.
+#[test]
+fn matrices_that_no_tile_is_made_for_are_not_used() {
+    for (side, subgroup) in [(8, 4), (8, 8), (16, 32), (16, 64)] {
+        assert_eq!(Matrices::new(side, subgroup), Some(Matrices { side, subgroup }));
+    }
+    for (side, subgroup) in [(4, 32), (32, 32), (16, 128), (8, 2), (16, 48), (16, 0)] {
+        assert_eq!(Matrices::new(side, subgroup), None, "{side}, {subgroup}");
+    }
 }
 
 #[test]
