@@ -93,6 +93,8 @@ pub struct TrainSettings {
     pub density_noise: f64,
     pub opaque_background: bool,
     pub refine_steps: usize,
+    /// Steps between two searches for lost cameras; 0 for none.
+    pub relocalise_every: usize,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -95,7 +95,8 @@ impl Trainer {
         self.learner.check_finite("corner error", &per_patch)?;
         let patch_psnr_db = psnr(loss.get("render").copied().unwrap_or(1.0));
         let measured = Measured::Planar { patch_psnr_db, corner_error_px: CornerError::new(per_patch) };
-        Ok((Entry { step: self.learner.steps_done(), loss, measured }, warps))
+        let relocalised = vec![];
+        Ok((Entry { step: self.learner.steps_done(), loss, measured, relocalised }, warps))
     }
 
     fn fill_data(&mut self) -> Result<(), Error> {

@@ -2,6 +2,7 @@
 
 use super::data::{SpaceData, SpaceDataError};
 use super::model::{self, RadianceModel, nothing_found};
+use super::relocalise::{Relocalised, relocalise};
 use super::results;
 use crate::Error;
 use crate::config::{DepthSettings, Layered, Settings};
@@ -24,7 +25,7 @@ const PLACES: usize = 16384;
 
 /// A model in training.
 pub struct Explorer {
-    /// Without the images of the training views, which live on the device.
+    /// Without the images of the training views, which live on the device (and in `photos`).
     pub data: Arc<SpaceData>,
     pub(super) settings: Settings,
     /// To measure pictures with, where there are weights.
@@ -34,11 +35,16 @@ pub struct Explorer {
     train: ProgramId,
     view: ProgramId,
     refine: ProgramId,
-    /// Compiled when it is first needed.
+    /// Compiled when they are first needed.
     density: Option<ProgramId>,
+    comparison: Option<ProgramId>,
     /// Pixels of one run of `view`.
     view_pixels: usize,
     rays: usize,
+    /// Cameras brought back since the last measurement.
+    relocalised: Vec<Relocalised>,
+    /// Packed pixels of the training views, where lost cameras are looked for.
+    photos: Vec<Vec<u32>>,
     /// Once training has ended.
     evaluation: Option<Evaluation>,
 }
@@ -69,19 +75,21 @@ impl Explorer {
         let refine = learner.add(&model.refinement())?;
         learner.fill(&model.parameters(), settings.run.seed)?;
         learner.set_seed(model::SEED, settings.run.seed)?;
-        let flat = |rows: Vec<[f64; 12]>| rows.concat().iter().map(|x| *x as f32).collect::<Vec<f32>>();
-        learner.set(model::POSES, &flat(data.start.poses.iter().map(|p| p.to_rows()).collect()))?;
+        learner.set(model::POSES, &flat_rows(&data.start.poses))?;
         learner.set(model::FOUND, &nothing_found(views))?;
         let intrinsics: Vec<f32> = data.scene.train.iter().flat_map(|v| lens(&v.intrinsics)).collect();
         learner.set(model::INTRINSICS, &intrinsics)?;
+        let relocalises = settings.train.as_ref().is_some_and(|t| t.relocalise_every > 0);
+        let mut photos = vec![];
         // From here on the images live on the device.
         for (i, view) in data.scene.train.iter_mut().enumerate() {
             let pixels: Vec<u32> = model::packed(view).collect();
             learner.session.set_u32_from(model::IMAGES, i * pixels.len(), &pixels)?;
             (view.pixels, view.depth, view.mask) = (vec![], None, None);
+            photos.extend(relocalises.then_some(pixels));
         }
         let (data, settings, rays) = (Arc::new(data), settings.clone(), model.rays_per_view() * views);
-        let (lpips, density, evaluation) = (None, None, None);
+        let (lpips, density, comparison, evaluation) = (None, None, None, None);
         Ok(Explorer {
             data,
             settings,
@@ -92,22 +100,26 @@ impl Explorer {
             view,
             refine,
             density,
+            comparison,
             view_pixels,
             rays,
+            relocalised: vec![],
+            photos,
             evaluation,
         })
     }
 
     /// The poses of the training views, as the last step found them.
     pub fn poses(&mut self) -> Result<Vec<Pose>, Error> {
-        let found = self.learner.session.get(model::FOUND)?;
-        let one = |(rough, found): (&Pose, &[f32])| rough.after(&Pose::from_rows(found));
-        Ok(self.data.start.poses.iter().zip(found.chunks(12)).map(one).collect())
+        let (rough, found) = (self.learner.session.get(model::POSES)?, self.learner.session.get(model::FOUND)?);
+        let one = |(rough, found)| Pose::from_rows::<f32>(rough).after(&Pose::from_rows(found));
+        Ok(rough.chunks(12).zip(found.chunks(12)).map(one).collect())
     }
 
     /// The whole image of a camera in the learned world.
     pub fn render(&mut self, pose: &Pose, intrinsics: &Intrinsics) -> Result<Rendered, Error> {
-        self.set_view(pose, intrinsics)?;
+        self.learner.set(model::VIEW_INTRINSICS, &lens(intrinsics))?;
+        self.set_pose(pose)?;
         let pixels = self.data.size.pixels();
         let mut seen = Rendered { rgb: vec![], depth: vec![], opacity: vec![] };
         for first in (0..pixels).step_by(self.view_pixels) {
@@ -126,16 +138,21 @@ impl Explorer {
         Ok(seen)
     }
 
-    /// `pose` after test-time refinement against a view's image: `P Exp(twist)` with Adam on the twist, the field as it is.
+    /// `pose` after test-time refinement against a view's image.
     pub fn refined(&mut self, pose: &Pose, view: &View) -> Result<Pose, Error> {
         let steps = self.settings.train.as_ref().map_or(0, |t| t.refine_steps);
-        self.set_view(pose, &view.intrinsics)?;
-        self.learner.set_u32(model::VIEW_IMAGE, &model::packed(view).collect::<Vec<_>>())?;
+        self.show_view(&view.intrinsics, &model::packed(view).collect::<Vec<_>>())?;
+        self.refine(pose, steps, self.settings.optim.lr_warp)
+    }
+
+    /// `pose` refined against the image that is shown: `P Exp(twist)` with Adam on the twist, the field as it is.
+    pub(super) fn refine(&mut self, pose: &Pose, steps: usize, rate: f64) -> Result<Pose, Error> {
+        self.set_pose(pose)?;
         for state in [model::TWIST.to_string(), format!("adam.m.{}", model::TWIST), format!("adam.v.{}", model::TWIST)]
         {
             self.learner.set(&state, &[0.0; 6])?;
         }
-        self.learner.set(model::TWIST_LR, &[self.settings.optim.lr_warp as f32])?;
+        self.learner.set(model::TWIST_LR, &[rate as f32])?;
         for step in 1..=steps {
             let (bias1, bias2) = Adam::default().bias_corrections(step as u64);
             self.learner.set(model::TWIST_BIAS1, &[bias1 as f32])?;
@@ -146,6 +163,36 @@ impl Explorer {
         }
         let twist = self.learner.session.get(model::TWIST)?;
         Ok(pose.after(&Pose::exp(&std::array::from_fn(|i| f64::from(twist[i])))))
+    }
+
+    /// Shows a training view to [`Self::refine`] and [`Self::photo_error`].
+    pub(super) fn show_training_view(&mut self, view: usize) -> Result<(), Error> {
+        let lens = self.data.scene.train[view].intrinsics.clone();
+        let photo = std::mem::take(&mut self.photos[view]);
+        let shown = self.show_view(&lens, &photo);
+        self.photos[view] = photo;
+        shown
+    }
+
+    /// Mean squared error of the image that is shown against what the model shows at `pose`; over the same pixels for all poses.
+    pub(super) fn photo_error(&mut self, pose: &Pose) -> Result<f64, Error> {
+        let program = match self.comparison {
+            Some(program) => program,
+            None => self.learner.add(&self.model.comparison())?,
+        };
+        self.comparison = Some(program);
+        self.set_pose(pose)?;
+        self.learner.run(program)?;
+        Ok(f64::from(self.learner.read(program, "render")?[0]))
+    }
+
+    /// Gives a training view the pose, by another rough one.
+    pub(super) fn place(&mut self, view: usize, pose: &Pose) -> Result<(), Error> {
+        let (mut rough, found) = (self.learner.session.get(model::POSES)?, self.learner.session.get(model::FOUND)?);
+        let row = 12 * view..12 * (view + 1);
+        let moved = pose.after(&Pose::from_rows(&found[row.clone()]).inverse());
+        rough[row].copy_from_slice(&moved.to_rows().map(|x| x as f32));
+        self.learner.set(model::POSES, &rough)
     }
 
     /// Densities at points of the learned world, in inverse lengths of it.
@@ -166,10 +213,13 @@ impl Explorer {
         Ok(found)
     }
 
-    fn set_view(&mut self, pose: &Pose, intrinsics: &Intrinsics) -> Result<(), Error> {
-        let rows = pose.to_rows().map(|x| x as f32);
-        self.learner.set(model::VIEW_POSE, &rows)?;
-        self.learner.set(model::VIEW_INTRINSICS, &lens(intrinsics))?;
+    fn show_view(&mut self, camera: &Intrinsics, photo: &[u32]) -> Result<(), Error> {
+        self.learner.set(model::VIEW_INTRINSICS, &lens(camera))?;
+        self.learner.set_u32(model::VIEW_IMAGE, photo)
+    }
+
+    fn set_pose(&mut self, pose: &Pose) -> Result<(), Error> {
+        self.learner.set(model::VIEW_POSE, &flat_rows(&[*pose]))?;
         if self.settings.train.as_ref().is_some_and(|t| t.depth == DepthSettings::Auto) {
             let centers: Vec<_> = self.poses()?.iter().map(Pose::center).collect();
             let largest = centers.iter().flat_map(|a| centers.iter().map(move |b| (a - b).norm())).fold(0.0, f64::max);
@@ -178,6 +228,11 @@ impl Explorer {
         }
         Ok(())
     }
+}
+
+/// `[R | t]` of poses, row by row.
+fn flat_rows(poses: &[Pose]) -> Vec<f32> {
+    poses.iter().flat_map(|p| p.to_rows()).map(|x| x as f32).collect()
 }
 
 /// fx, fy, cx, cy.
@@ -195,6 +250,15 @@ impl Training for Explorer {
     fn training_program(&self) -> ProgramId {
         self.train
     }
+    fn step(&mut self) -> Result<(), Error> {
+        self.learner.train(self.train)?;
+        let every = self.settings.train.as_ref().map_or(0, |t| t.relocalise_every);
+        if every > 0 && self.steps_done().is_multiple_of(every) {
+            let back = relocalise(self)?;
+            self.relocalised.extend(back);
+        }
+        Ok(())
+    }
     fn measure(&mut self) -> Result<Entry, Error> {
         let loss = self.learner.losses(self.train)?;
         let found = self.poses()?;
@@ -206,7 +270,8 @@ impl Training for Explorer {
             rotation_error_deg: errors.rotation_error_deg,
             translation_error_x100: errors.translation_error_x100,
         };
-        Ok(Entry { step: self.learner.steps_done(), loss, measured })
+        let relocalised = std::mem::take(&mut self.relocalised);
+        Ok(Entry { step: self.learner.steps_done(), loss, measured, relocalised })
     }
     fn flops(&self) -> f64 {
         self.model.flops()

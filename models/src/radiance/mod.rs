@@ -8,6 +8,7 @@ mod mesh;
 pub mod model;
 mod novel_views;
 pub mod rays;
+mod relocalise;
 mod rendering;
 pub mod results;
 
@@ -15,3 +16,4 @@ pub use data::SpaceData;
 pub use explorer::{Explorer, Rendered};
 pub use model::{NotInSpace, RadianceModel};
 pub use novel_views::NovelViews;
+pub use relocalise::Relocalised;

@@ -34,11 +34,11 @@ use std::sync::Arc;
 pub const IMAGES: &str = "data.images";
 /// fx, fy, cx, cy of every frame.
 pub const INTRINSICS: &str = "data.intrinsics";
-/// Poses that training starts from, `[frame] x (3, 4)`.
+/// Rough poses that the warp starts from, `[frame] x (3, 4)`: a state, since lost cameras are given others.
 pub const POSES: &str = "data.poses";
 /// What tells the draws of two seeds apart.
 pub const SEED: &str = "data.seed";
-/// What the last step found between the poses that training started from and the true ones, `[frame] x (3, 4)`.
+/// What the last step found between the rough poses and the true ones, `[frame] x (3, 4)`.
 pub const FOUND: &str = "camera.found";
 /// The camera of a rendered view: its pose, intrinsics, first pixel of the part that is rendered, near and far.
 pub const VIEW_POSE: &str = "view.pose";
@@ -146,7 +146,7 @@ impl RadianceModel {
     #[track_caller]
     pub fn step_at(&self, ray: &Axis, index: &Tensor, colors: &Tensor) -> Step {
         let intrinsics = Tensor::data(INTRINSICS, Shape::new(&[&self.frame], 4));
-        let rough = Tensor::data(POSES, Shape::new(&[&self.frame], (3, 4)));
+        let rough = Tensor::input(POSES, Role::State, Shape::new(&[&self.frame], (3, 4)));
         let cameras = Cameras::new(&self.frame, ray, index, self.size, &intrinsics, &rough);
         let none = Tensor::scalar(0.0);
         let code = self.code.as_ref().map_or(&none, |c| &c.tensor);
@@ -198,23 +198,35 @@ impl RadianceModel {
         Step { outputs: outputs.map(|(name, t)| (name.to_string(), t.clone())).into(), updates: vec![] }
     }
 
-    /// One step of the refinement of a test view's pose against its image, `P Exp(twist)` with the field as it is: Adam on
-    /// the twist alone. Output `render`, with a fine field the sum of both pictures' terms.
+    /// One step of the refinement of a view's pose against its image, `P Exp(twist)` with the field as it is: Adam on the
+    /// twist alone. Output `render`, with a fine field the sum of both pictures' terms.
     #[track_caller]
     pub fn refinement(&self) -> Step {
-        let point = Axis::new("view", self.train.rays.min(self.size.pixels()));
-        let draw = random::uniform(&Axes::new([point.clone()]), 1, PIXELS, &seeded_step());
-        let pixels = self.size.pixels() as f64;
-        let index = (draw * pixels).clamp(0.0, pixels - 1.0).to_u32();
         let twist = Tensor::input(TWIST, Role::State, Shape::new(&[], 6));
-        let rays = self.view_rays(&point, &index, &compose_poses(&view_pose(), &se3_exp(&twist)));
-        let seen = self.see(&rays, &Axes::new([point]), Purpose::Refinement);
-        let image = Tensor::data(VIEW_IMAGE, Shape::new(&[&self.pixel], 1).with_dtype(DType::U32));
-        let render = Pictures::new(&seen, &on_white(&image.take(&index, &self.pixel))).both;
+        let render = self.photo_error(&compose_poses(&view_pose(), &se3_exp(&twist)));
         let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
         let scalars = StepScalars { lr: scalar(TWIST_LR), bias1: scalar(TWIST_BIAS1), bias2: scalar(TWIST_BIAS2) };
         let updates = update_of(&render, &twist, &scalars, self.settings.run.precision);
         Step { outputs: vec![("render".to_string(), render)], updates }
+    }
+
+    /// How far the model's picture of a view is from its image, at random pixels: output `render` as of [`Self::refinement`].
+    #[track_caller]
+    pub fn comparison(&self) -> Step {
+        Step { outputs: vec![("render".to_string(), self.photo_error(&view_pose()))], updates: vec![] }
+    }
+
+    /// Mean squared error against [`VIEW_IMAGE`] of random pixels seen from `pose`.
+    #[track_caller]
+    fn photo_error(&self, pose: &Tensor) -> Tensor {
+        let point = Axis::new("view", self.train.rays.min(self.size.pixels()));
+        let draw = random::uniform(&Axes::new([point.clone()]), 1, PIXELS, &seeded_step());
+        let pixels = self.size.pixels() as f64;
+        let index = (draw * pixels).clamp(0.0, pixels - 1.0).to_u32();
+        let rays = self.view_rays(&point, &index, pose);
+        let seen = self.see(&rays, &Axes::new([point]), Purpose::Refinement);
+        let image = Tensor::data(VIEW_IMAGE, Shape::new(&[&self.pixel], 1).with_dtype(DType::U32));
+        Pictures::new(&seen, &on_white(&image.take(&index, &self.pixel))).both
     }
 
     /// The field at `count` points of the learned world, [`DENSITY_POINTS`]: output `density`.

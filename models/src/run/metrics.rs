@@ -1,5 +1,6 @@
 //! `metrics.json`: what was measured, per logged step and at the end.
 
+use crate::radiance::Relocalised;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -12,6 +13,9 @@ pub struct Entry {
     pub loss: BTreeMap<String, f64>,
     #[serde(flatten)]
     pub measured: Measured,
+    /// Cameras brought back since the last entry, see `train.relocalise_every`.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub relocalised: Vec<Relocalised>,
 }
 
 /// What is measured besides the losses.

@@ -33,7 +33,9 @@ impl Progress {
 
     fn state(entry: &Entry) -> String {
         let total = entry.loss.get("total").copied().unwrap_or(0.0);
-        format!("loss {total:.5}  PSNR {:.2} dB  {}", entry.psnr_db(), entry.error_text())
+        let views: Vec<&str> = entry.relocalised.iter().map(|r| r.view.as_str()).collect();
+        let back = if views.is_empty() { String::new() } else { format!("  brought back {}", views.join(", ")) };
+        format!("loss {total:.5}  PSNR {:.2} dB  {}{back}", entry.psnr_db(), entry.error_text())
     }
 }
 
