@@ -4,7 +4,7 @@ use crate::{DeviceError, RunError};
 use raygrad_compiler::{Program, Target};
 use raygrad_kernels::cpu::Isa;
 #[cfg(feature = "gpu")]
-use raygrad_kernels::gpu::{Half, storages};
+use raygrad_kernels::gpu::{Half, SOFTWARE_TILES, storages};
 use std::sync::Arc;
 
 /// A device to run sessions on.
@@ -26,8 +26,16 @@ pub enum Device {
 pub struct Forms {
     /// What kernels use for half precision; `None` at single precision.
     pub half: Option<Half>,
-    /// How many of the largest tiles not to use ([`raygrad_kernels::gpu::Limits::tiles`]).
+    /// How many of the largest tiles not to use ([`raygrad_kernels::gpu::Limits::tiles`]); software has tiles of its own.
     pub tiles: u32,
+}
+
+#[cfg(feature = "gpu")]
+impl Forms {
+    /// What suits an adapter: software has tiles of its own.
+    fn of(adapter: &crate::Adapter) -> Forms {
+        Forms { half: None, tiles: if adapter.kind == crate::AdapterKind::Software { SOFTWARE_TILES } else { 0 } }
+    }
 }
 
 /// How precise a device computes.
@@ -72,7 +80,9 @@ impl Device {
     /// The adapter numbered `index` in [`Device::list`], or the best one, software included.
     #[cfg(feature = "wgpu")]
     pub fn wgpu(index: Option<usize>) -> Result<Device, DeviceError> {
-        Ok(Device::Wgpu { gpu: Arc::new(crate::wgpu::Gpu::open(index)?), forms: Forms::default() })
+        let gpu = crate::wgpu::Gpu::open(index)?;
+        let forms = Forms::of(gpu.adapter());
+        Ok(Device::Wgpu { gpu: Arc::new(gpu), forms })
     }
 
     /// This build has no wgpu backend.
@@ -84,7 +94,9 @@ impl Device {
     /// The Vulkan driver numbered `index` in [`Device::list`], or the best one, software included.
     #[cfg(feature = "vulkan")]
     pub fn vulkan(index: Option<usize>) -> Result<Device, DeviceError> {
-        Ok(Device::Vulkan { gpu: Arc::new(crate::vulkan::Gpu::open(index)?), forms: Forms::default() })
+        let gpu = crate::vulkan::Gpu::open(index)?;
+        let forms = Forms::of(gpu.adapter());
+        Ok(Device::Vulkan { gpu: Arc::new(gpu), forms })
     }
 
     /// This build has no Vulkan backend.

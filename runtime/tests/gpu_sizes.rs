@@ -13,7 +13,7 @@ use raygrad_compiler::reference::{Array, Bindings, evaluate};
 use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Step, compile};
 use raygrad_kernels::gpu::Half;
-use raygrad_runtime::{Device, Forms, Precision, ProgramId, Session};
+use raygrad_runtime::{Device, Precision, ProgramId, Session};
 use raygrad_tests::backend::compare;
 use raygrad_tests::{Rng, seed, total};
 
@@ -154,6 +154,21 @@ fn concatenations_of_layers(device: &Device) {
         let gradients = grad(&total(&(&y * up)), &[&x, &w, &v]);
         let outputs = [vec![("y", y)], ["dx", "dw", "dv"].into_iter().zip(gradients).collect()].concat();
         check(device, outputs, 2e-5, &format!("{inputs} and {hidden} channels of {rows} rows, relu: {relu}"));
+    }
+}
+
+/// Tiles for drivers in software in all places of a layer, whole and ragged; with `RAYGRAD_NIGHTLY=1` in all of the other tests,
+/// whose kernels take such a driver minutes to compile.
+fn tiles_of_software(device: &Device) {
+    if std::env::var_os("RAYGRAD_NIGHTLY").is_some_and(|v| v == "1") {
+        [layers_of_all_widths, totals_of_layers, concatenations_of_layers, halves].iter().for_each(|test| test(device));
+    }
+    layer(device, 2, 333, 34, 64, false);
+    layer(device, 3, 40, 21, 50, true);
+    check(device, layer_totals(300, 34, 72), 2e-5, "totals of 300, 34 to 72");
+    if device.has_half().is_some() {
+        let device = device.clone().with_half(Some(Half { matrices: None }));
+        check(&device, layer_outputs(1, 200, 20, 36, false).0, 3e-3, "halves");
     }
 }
 
@@ -387,12 +402,12 @@ fn narrow(device: &Device) -> Device {
         #[cfg(feature = "wgpu")]
         Device::Wgpu { .. } => {
             let gpu = raygrad_runtime::wgpu::Gpu::open(None).unwrap().with_max_binding(limit);
-            Device::Wgpu { gpu: gpu.into(), forms: Forms::default() }
+            Device::Wgpu { gpu: gpu.into(), forms: device.forms() }
         }
         #[cfg(feature = "vulkan")]
         Device::Vulkan { .. } => {
             let gpu = raygrad_runtime::vulkan::Gpu::open(None).unwrap().with_max_binding(limit);
-            Device::Vulkan { gpu: gpu.into(), forms: Forms::default() }
+            Device::Vulkan { gpu: gpu.into(), forms: device.forms() }
         }
     }
 }
@@ -455,3 +470,16 @@ on_every_backend!(
     two_programs_share_their_inputs,
     buffers_beyond_the_binding_limit,
 );
+
+/// The same with tiles for drivers in software, which the tests above leave to users of such drivers.
+mod software {
+    macro_rules! tests {
+        ($($name:ident),*) => {
+            $(#[test]
+            fn $name() {
+                raygrad_tests::backend::software().iter().for_each(super::$name);
+            })*
+        };
+    }
+    tests!(tiles_of_software, training_follows_the_reference_and_repeats_bit_by_bit, buffers_beyond_the_binding_limit);
+}

@@ -24,14 +24,31 @@ pub fn gpus() -> Vec<Device> {
     [wgpu(), vulkan()].into_iter().flatten().collect()
 }
 
-/// The best adapter through wgpu; `None` only where `RAYGRAD_NO_GPU=1` says that there is none.
+/// The best adapter through wgpu; `None` only where `RAYGRAD_NO_GPU=1` says that there is none. It runs the forms of kernels that
+/// GPUs run, software or not.
 pub fn wgpu() -> Option<Device> {
-    unless_none_is_expected(Device::wgpu(None))
+    unless_none_is_expected(Device::wgpu(None)).map(of_gpus)
 }
 
 /// The same through Vulkan.
 pub fn vulkan() -> Option<Device> {
-    unless_none_is_expected(Device::vulkan(None))
+    unless_none_is_expected(Device::vulkan(None)).map(of_gpus)
+}
+
+#[cfg(feature = "gpu")]
+fn of_gpus(device: Device) -> Device {
+    device.with_forms(raygrad_runtime::Forms::default())
+}
+#[cfg(not(feature = "gpu"))]
+fn of_gpus(device: Device) -> Device {
+    device
+}
+
+/// The best adapter through Vulkan with the tiles of drivers in software.
+#[cfg(feature = "gpu")]
+pub fn software() -> Option<Device> {
+    let forms = raygrad_runtime::Forms { tiles: raygrad_kernels::gpu::SOFTWARE_TILES, ..Default::default() };
+    Some(vulkan()?.with_forms(forms))
 }
 
 fn unless_none_is_expected(opened: Result<Device, DeviceError>) -> Option<Device> {

@@ -6,7 +6,7 @@ use raygrad::radiance::RadianceModel;
 use raygrad::radiance::rays::ImageSize;
 use raygrad::warps;
 use raygrad_compiler::{Step, Target, compile};
-use raygrad_kernels::gpu::{Inputs, Kernel, Limits, lower};
+use raygrad_kernels::gpu::{Inputs, Kernel, Limits, TILES, lower};
 use raygrad_tests::forms::forms;
 use raygrad_tests::planar::Planar;
 
@@ -32,12 +32,15 @@ fn excess(kernel: &Kernel) -> Vec<String> {
 
 fn check(name: &str, step: &Step) {
     let program = compile(step, &Target::gpu()).unwrap_or_else(|e| panic!("{name}: {e}"));
-    let lowered = lower(&program, &mut Inputs::default(), &Limits::default());
-    let lowered = lowered.unwrap_or_else(|e| panic!("{name}: {e}"));
-    let kernels: Vec<&Kernel> = lowered.launches.iter().flat_map(|l| &l.kernels).collect();
-    assert!(!kernels.is_empty());
-    let found: Vec<String> = kernels.into_iter().flat_map(excess).collect();
-    assert!(found.is_empty(), "{name}\n{}", found.join("\n"));
+    for tiles in 0..TILES {
+        let limits = Limits { tiles, ..Limits::default() };
+        let lowered = lower(&program, &mut Inputs::default(), &limits);
+        let lowered = lowered.unwrap_or_else(|e| panic!("{name}, tiles {tiles}: {e}"));
+        let kernels: Vec<&Kernel> = lowered.launches.iter().flat_map(|l| &l.kernels).collect();
+        assert!(!kernels.is_empty());
+        let found: Vec<String> = kernels.into_iter().flat_map(excess).collect();
+        assert!(found.is_empty(), "{name}, tiles {tiles}\n{}", found.join("\n"));
+    }
 }
 
 #[test]

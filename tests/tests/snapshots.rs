@@ -66,7 +66,7 @@ mod wgsl {
     use raygrad_compiler::autodiff::grad;
     use raygrad_compiler::graph::{Axis, Shape, Tensor};
     use raygrad_compiler::{Step, Target, compile};
-    use raygrad_kernels::gpu::{Half, Inputs, Limits, Matrices, lower};
+    use raygrad_kernels::gpu::{Half, Inputs, Limits, Matrices, SOFTWARE_TILES, lower};
     use raygrad_tests::forms::forms;
 
     /// Every kernel of a step.
@@ -92,9 +92,10 @@ mod wgsl {
         }
     }
 
-    /// A layer and what follows from it in half precision, without cooperative matrices and with them.
+    /// A layer and what follows from it in half precision, without cooperative matrices and with them, and in the tiles of drivers
+    /// in software.
     #[test]
-    fn kernels_of_halves() {
+    fn kernels_of_other_tiles() {
         let row = Axis::new("row", 1200);
         let x = Tensor::data("x", Shape::new(&[&row], 40));
         let w = Tensor::parameter("w", Shape::new(&[], (40, 100)));
@@ -108,6 +109,7 @@ mod wgsl {
             let limits = Limits { half: Some(Half { matrices }), max_workgroup_bytes: 48 << 10, ..Limits::default() };
             snapshot(&format!("wgsl-{name}"), &kernels_within(&step, &limits));
         }
+        snapshot("wgsl-software", &kernels_within(&step, &Limits { tiles: SOFTWARE_TILES, ..Limits::default() }));
     }
 
     #[test]

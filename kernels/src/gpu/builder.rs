@@ -232,11 +232,11 @@ impl Builder {
     }
 
     /// An array of this invocation alone.
-    pub fn private(&mut self, name: &str, kind: Kind, size: u32) -> Memory {
-        let ty = self.array(kind, false, fixed(size));
+    pub fn private(&mut self, name: &str, kind: Kind, vector: bool, size: u32) -> Memory {
+        let ty = self.array(kind, vector, fixed(size));
         let variable = LocalVariable { name: Some(name.into()), ty, init: None };
         let variable = self.function.local_variables.append(variable, Span::UNDEFINED);
-        Memory { pointer: self.free(Expression::LocalVariable(variable)), kind, vector: false }
+        Memory { pointer: self.free(Expression::LocalVariable(variable)), kind, vector }
     }
 
     /// A variable with a first value.

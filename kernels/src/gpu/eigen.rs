@@ -10,8 +10,8 @@ use naga::{BinaryOperator as Op, MathFunction as Math, UnaryOperator};
 /// each with its largest component positive.
 pub(super) fn sym_eig(b: &mut Builder, n: u32, matrix: &[Value]) -> Memory {
     b.topic("eigen");
-    let a = b.private("matrix", Kind::F32, n * n);
-    let v = b.private("vectors", Kind::F32, n * n);
+    let a = b.private("matrix", Kind::F32, false, n * n);
+    let v = b.private("vectors", Kind::F32, false, n * n);
     for i in 0..n * n {
         let (at, half) = (b.u(i), b.f(0.5));
         let twice = b.add(matrix[i as usize], matrix[(i % n * n + i / n) as usize]);
@@ -97,7 +97,7 @@ fn rotate(b: &mut Builder, a: Memory, v: Memory, p: Value, q: Value, n: Value) {
 
 /// Each eigenvalue goes to the place that its rank names, its eigenvector to the column.
 fn sorted(b: &mut Builder, a: Memory, v: Memory, n: u32) -> Memory {
-    let result = b.private("eigen", Kind::F32, n + n * n);
+    let result = b.private("eigen", Kind::F32, false, n + n * n);
     let (none, size, one) = (b.u(0), b.u(n), b.u(1));
     let j = b.open_loop("j", none, size, 1);
     let jj = at(b, size, j, j);

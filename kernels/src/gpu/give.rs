@@ -102,30 +102,49 @@ pub(super) fn give_blocks(
         let values = epilogue.sums(e, &places, &found);
         totals.add(e, &values);
     }
+    through_columns(e, tile, &own_n, column, epilogue, &mut |e, which, j| e.b.get(totals.0[which].1[j]));
+}
+
+/// Combines the totals of the invocations that have the same n, of each of which `across` have one, through workgroup memory.
+/// `own` gives this invocation's total of the kind with a number for the n with a number.
+pub(super) fn through_columns(
+    e: &mut Emit,
+    tile: Tile,
+    own_n: &[Value],
+    column: Value,
+    epilogue: &mut dyn Epilogue,
+    own: &mut dyn FnMut(&mut Emit, usize, usize) -> Value,
+) {
+    let (kinds, across) = (epilogue.kinds(), tile.m / tile.own_m);
     if kinds.is_empty() {
         return;
     }
-    // Of each n, `across` invocations have a total.
     e.b.topic("column");
     let memory = e.b.workgroup("columns", Kind::F32, false, tile.n * across);
-    for (which, (kind, totals)) in totals.0.iter().enumerate() {
+    for (which, kind) in kinds.iter().enumerate() {
         if which > 0 {
             e.b.barrier();
         }
         let across_value = e.b.u(across);
-        for (n, total) in own_n.iter().zip(totals) {
+        for (j, n) in own_n.iter().enumerate() {
             let at = e.b.mul(*n, across_value);
             let at = e.b.add(at, column);
-            let value = e.b.get(*total);
+            let value = own(e, which, j);
             e.b.store(memory, at, value);
         }
         e.b.barrier();
-        let (n, part) = (e.invocation, e.b.u(0));
-        e.if_below(n, Some(tile.n), |e| {
-            let first = e.b.mul(n, across_value);
-            let value = combine_lanes(e, *kind, memory, first, (across, 1));
-            epilogue.total(e, which, Total { n, part, value });
-        });
+        let (mut n, part) = (e.invocation, e.b.u(0));
+        for done in (0..tile.n).step_by(tile.invocations() as usize) {
+            if done > 0 {
+                let before = e.b.u(done);
+                n = e.b.add(e.invocation, before);
+            }
+            e.if_below(n, Some(tile.n), |e| {
+                let first = e.b.mul(n, across_value);
+                let value = combine_lanes(e, *kind, memory, first, (across, 1));
+                epilogue.total(e, which, Total { n, part, value });
+            });
+        }
     }
 }
 
@@ -289,7 +308,7 @@ impl Strips {
 }
 
 /// `4 (before + own) + extra`
-fn place(e: &mut Emit, own: Value, before: u32, extra: u32) -> Value {
+pub(super) fn place(e: &mut Emit, own: Value, before: u32, extra: u32) -> Value {
     let (before, four, extra) = (e.b.u(before), e.b.u(4), e.b.u(extra));
     let at = e.b.add(own, before);
     let at = e.b.mul(at, four);

@@ -28,7 +28,7 @@ pub struct Limits {
     /// Memory that a workgroup may share.
     pub max_workgroup_bytes: u32,
     /// How many of the largest tiles of matrix products not to use, which would otherwise be preferred: what is fastest
-    /// depends on the device. [`TILES`] are there to choose from.
+    /// depends on the device. [`TILES`] are there to choose from; the last are [`SOFTWARE_TILES`].
     pub tiles: u32,
     /// Mixed precision: what matrix products read is stored in half precision, and sums stay in single. `None`: all is
     /// single.
@@ -36,7 +36,10 @@ pub struct Limits {
 }
 
 /// Choices of [`Limits::tiles`].
-pub const TILES: u32 = 3;
+pub const TILES: u32 = 4;
+/// The last of them, tiles for drivers in software: their "invocations" are lanes of a CPU's vectors, which take a value that is
+/// the same for all at once, and values that differ one by one.
+pub const SOFTWARE_TILES: u32 = TILES - 1;
 
 impl Default for Limits {
     /// What WebGPU guarantees.

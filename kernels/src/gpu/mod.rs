@@ -8,12 +8,13 @@
 //! | `channels`, `eval`, `scalar`, `eigen` | values of a region at a position |
 //! | `parts`, `stages` | a region cut into what one kind of kernel does, and long work into stages |
 //! | `elements`, `reduce`, `chunks`, `scatter`, `scan`, `layer`, `outer` | the kinds of kernels |
-//! | `tile`, `sums`, `give`, `epilogue` | matrix products in tiles, and what is done with their sums |
+//! | `tile`, `direct`, `sums`, `give`, `epilogue` | matrix products in tiles, and what is done with their sums |
 //! | `peak` | kernels that measure a device |
 
 mod builder;
 mod channels;
 mod chunks;
+mod direct;
 mod eigen;
 mod elements;
 mod epilogue;
@@ -36,7 +37,7 @@ mod sums;
 mod tile;
 
 pub use half::{Half, Matrices, Storage, storages};
-pub use layout::{Arena, ArenaId, Inputs, Limits, Part, Place, TILES};
+pub use layout::{Arena, ArenaId, Inputs, Limits, Part, Place, SOFTWARE_TILES, TILES};
 
 pub use peak::{copy, matrix_products, multiply_adds};
 

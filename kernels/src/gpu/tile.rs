@@ -6,9 +6,10 @@
 //! come out four `m` at a time. Channel-major buffers make this one kernel for layers and for weight gradients.
 
 use super::builder::{Factor, Kind, MatrixAt, Memory, Value, Var};
+use super::direct::{self, STEP};
 use super::give::Epilogue;
 use super::half::Matrices;
-use super::layout::Limits;
+use super::layout::{Limits, SOFTWARE_TILES};
 use super::memory::Emit;
 use super::sums::Sums;
 
@@ -31,6 +32,8 @@ pub(super) struct Tile {
     pub own_m: u32,
     pub own_n: u32,
     pub matrices: Option<Matrices>,
+    /// Whether an invocation has all `n`, and reads its `m` where they lie.
+    pub direct: bool,
 }
 
 impl Tile {
@@ -40,6 +43,9 @@ impl Tile {
             let workgroups = m.div_ceil(t.m as usize) as u64 * n.div_ceil(t.n as usize) as u64 * products as u64;
             workgroups >= ENOUGH && t.bytes() <= limits.max_workgroup_bytes && t.invocations() <= MOST_INVOCATIONS
         };
+        if limits.tiles == SOFTWARE_TILES && n > 16 {
+            return Tile::direct(m, n, k);
+        }
         let skipped = limits.tiles as usize;
         if let Some(matrices) = limits.half.and_then(|h| h.matrices)
             && n > 32
@@ -49,7 +55,7 @@ impl Tile {
             let side = matrices.side;
             let tile = |m, n, (own_m, own_n): (u32, u32)| {
                 let (own_m, own_n) = (own_m * side, own_n * side);
-                Tile { m, n, k: 32, own_m, own_n, matrices: Some(matrices) }
+                Tile { m, n, k: 32, own_m, own_n, matrices: Some(matrices), direct: false }
             };
             let all = match n {
                 0..=64 => vec![tile(128, 64, (2, 2))],
@@ -66,7 +72,7 @@ impl Tile {
             _ if n <= 4 => 8,
             _ => 16,
         };
-        let tile = |m, n, k, own_m, own_n| Tile { m, n, k, own_m, own_n, matrices: None };
+        let tile = |m, n, k, own_m, own_n| Tile { m, n, k, own_m, own_n, matrices: None, direct: false };
         match n {
             0..=4 => tile(256, 4, deep, 4, 4),
             5..=8 => tile(128, 8, deep, 4, 4),
@@ -81,11 +87,27 @@ impl Tile {
         }
     }
 
+    /// A tile for drivers in software.
+    fn direct(m: usize, n: usize, k: usize) -> Tile {
+        const MOST_N: usize = 32;
+        let n = n.div_ceil(n.div_ceil(MOST_N)).next_multiple_of(4) as u32;
+        let (m, own_m) = match m {
+            0..=32 => (32, 4),
+            33..=64 => (64, 8),
+            _ => (128, 8),
+        };
+        let k = k.next_multiple_of(STEP as usize).min(32) as u32;
+        Tile { m, n, k, own_m, own_n: n, matrices: None, direct: true }
+    }
+
     /// Memory that a workgroup shares.
     fn bytes(&self) -> u32 {
         match self.matrices {
             // Staged, and what the columns' totals pass through.
-            None => self.k * (self.m / 4 + 1 + self.n / 4 + 1) * 16 + self.n * (self.m / self.own_m) * 4,
+            None => {
+                let vectors = if self.direct { 0 } else { self.m / 4 + 1 } + self.n / 4 + 1;
+                self.k * vectors * 16 + self.n * (self.m / self.own_m) * 4
+            }
             Some(Matrices { side, subgroup }) => {
                 let staged = (self.m + self.n) * (self.k / 4 + 2) * 8;
                 staged + self.invocations() / subgroup * side * (self.strip(side) / 4 + 1) * 16
@@ -142,6 +164,9 @@ pub(super) fn multiply(
     b: Operand,
     epilogue: &mut dyn Epilogue,
 ) {
+    if tile.direct {
+        return direct::multiply(e, tile, (from, to), a, b, epilogue);
+    }
     let mut a = Staged::new(e, tile, "tile_a", tile.m, a);
     let mut b = Staged::new(e, tile, "tile_b", tile.n, b);
     let sums = Sums::new(e, tile);
@@ -179,7 +204,7 @@ pub(super) struct Staged<'a> {
 }
 
 impl<'a> Staged<'a> {
-    fn new(e: &mut Emit, tile: Tile, name: &str, edge: u32, operand: Operand<'a>) -> Staged<'a> {
+    pub fn new(e: &mut Emit, tile: Tile, name: &str, edge: u32, operand: Operand<'a>) -> Staged<'a> {
         let half = tile.matrices.is_some();
         // Padding keeps the lines of a tile in different banks.
         let padding = if half { 2 } else { 1 };
@@ -195,7 +220,7 @@ impl<'a> Staged<'a> {
         if half {
             zeros = e.b.half(zeros);
         }
-        let count = (tile.k * edge / 4).div_ceil(tile.invocations());
+        let count = if !tile.direct { (tile.k * edge / 4).div_ceil(tile.invocations()) } else { 0 };
         let fetched = (0..count).map(|i| e.b.var(&format!("{name}_next_n{i}_"), zeros)).collect();
         Staged { operand, memory, edge, along, line, fetched }
     }
@@ -208,29 +233,46 @@ impl<'a> Staged<'a> {
             let offset = e.b.u(done);
             let number = e.b.add(e.invocation, offset);
             let partly = vectors - done < invocations;
-            if partly {
-                let all = e.b.u(vectors);
-                let inside = e.b.less(number, all);
-                e.b.open_if(inside);
+            e.if_below(number, partly.then_some(vectors), |e| {
+                let (k, at) = self.locate(e, tile, number);
+                act(self, e, i, k, at);
+            });
+        }
+    }
+
+    /// k and the position in the tile of a vector by its number in the order of the operand.
+    fn locate(&self, e: &mut Emit, tile: Tile, number: Value) -> (Value, Value) {
+        let four = e.b.u(4);
+        match self.operand.along {
+            Along::K => {
+                let deep = e.b.u(tile.k / 4);
+                let k = e.b.rem(number, deep);
+                (e.b.mul(k, four), e.b.div(number, deep))
             }
-            let four = e.b.u(4);
-            let (k, at) = match self.operand.along {
-                Along::K => {
-                    let deep = e.b.u(tile.k / 4);
-                    let k = e.b.rem(number, deep);
-                    (e.b.mul(k, four), e.b.div(number, deep))
-                }
-                Along::Edge => {
-                    let wide = e.b.u(self.edge / 4);
-                    let at = e.b.rem(number, wide);
-                    (e.b.div(number, wide), e.b.mul(at, four))
-                }
-            };
-            act(self, e, i, k, at);
-            if partly {
-                e.b.close_if();
+            Along::Edge => {
+                let wide = e.b.u(self.edge / 4);
+                let at = e.b.rem(number, wide);
+                (e.b.div(number, wide), e.b.mul(at, four))
             }
         }
+    }
+
+    /// From memory into workgroup memory, in a loop; `one` is 1.
+    pub fn pass(&mut self, e: &mut Emit, tile: Tile, first: Value, one: Value) {
+        let vectors = tile.k * self.edge / 4;
+        let (none, all) = (e.b.u(0), e.b.u(vectors));
+        let all = e.b.mul(all, one);
+        let before = e.b.open_loop("staged", none, all, tile.invocations());
+        let number = e.b.add(before, e.invocation);
+        let partly = !vectors.is_multiple_of(tile.invocations());
+        e.if_below(number, partly.then_some(vectors), |e| {
+            let (own_k, at) = self.locate(e, tile, number);
+            let k = e.b.add(first, own_k);
+            let value = (self.operand.load)(e, k, at);
+            let value = e.b.splat(value);
+            self.write(e, own_k, at, value);
+        });
+        e.b.close_loop();
     }
 
     /// From memory.
@@ -248,21 +290,25 @@ impl<'a> Staged<'a> {
     fn put(&mut self, e: &mut Emit, tile: Tile) {
         self.each(e, tile, |own, e, i, k, at| {
             let value = e.b.get(own.fetched[i]);
-            if own.along == own.operand.along {
-                let to = own.element(e, k, at);
-                e.b.store(own.memory, to, value);
-                return;
-            }
-            // Lines run along the edge, the four neighbours along k.
-            let lanes = e.b.u(own.line * 4);
-            for j in 0..4 {
-                let (offset, lane) = (e.b.u(j), e.b.component(value, j));
-                let k = e.b.add(k, offset);
-                let to = e.b.mul(k, lanes);
-                let to = e.b.add(to, at);
-                e.b.store_lane(own.memory, to, lane);
-            }
+            own.write(e, k, at, value);
         });
+    }
+
+    fn write(&self, e: &mut Emit, k: Value, at: Value, value: Value) {
+        if self.along == self.operand.along {
+            let to = self.element(e, k, at);
+            e.b.store(self.memory, to, value);
+            return;
+        }
+        // Lines run along the edge, the four neighbours along k.
+        let lanes = e.b.u(self.line * 4);
+        for j in 0..4 {
+            let (offset, lane) = (e.b.u(j), e.b.component(value, j));
+            let k = e.b.add(k, offset);
+            let to = e.b.mul(k, lanes);
+            let to = e.b.add(to, at);
+            e.b.store_lane(self.memory, to, lane);
+        }
     }
 
     /// Number of the vector at `(k, edge)`.

@@ -5,7 +5,7 @@ use super::model::{self, RadianceModel, nothing_found};
 use super::relocalise::{Relocalised, relocalise};
 use super::results;
 use crate::Error;
-use crate::config::{DepthSettings, Layered, Settings};
+use crate::config::{DepthSettings, Layered, Method, Settings};
 use crate::evaluation::{Evaluation, Lpips, Metric, Stage};
 use crate::geometry::Pose;
 use crate::run::RunFolder;
@@ -252,8 +252,10 @@ impl Training for Explorer {
     }
     fn step(&mut self) -> Result<(), Error> {
         self.learner.train(self.train)?;
+        // Known poses are not lost.
+        let known = self.settings.warp.method == Method::None;
         let every = self.settings.train.as_ref().map_or(0, |t| t.relocalise_every);
-        if every > 0 && self.steps_done().is_multiple_of(every) {
+        if every > 0 && !known && self.steps_done().is_multiple_of(every) {
             let back = relocalise(self)?;
             self.relocalised.extend(back);
         }
