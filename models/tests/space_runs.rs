@@ -53,7 +53,7 @@ impl Observer for StopAt<'_> {
 fn an_interrupted_run_resumes_bit_by_bit_with_every_method() {
     let methods = [
         &["warp.method=local"][..],
-        &["warp.method=global"],
+        &["warp.method=global", "train.relocalise_every=3"],
         &["warp.method=none", "scene.poses=truth"],
         &["warp.method=invertible", "warp.activation=softplus", "warp.inn.anneal=point-slots"],
         &["warp.method=multi-invertible"],

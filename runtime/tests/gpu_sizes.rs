@@ -165,7 +165,10 @@ fn tiles_of_software(device: &Device) {
     }
     layer(device, 2, 333, 34, 64, false);
     layer(device, 3, 40, 21, 50, true);
-    check(device, layer_totals(300, 34, 72), 2e-5, "totals of 300, 34 to 72");
+    // More rows than a workgroup has, and so few that it has more columns than invocations.
+    for rows in [300, 100, 30] {
+        check(device, layer_totals(rows, 34, 72), 2e-5, &format!("totals of {rows}, 34 to 72"));
+    }
     if device.has_half().is_some() {
         let device = device.clone().with_half(Some(Half { matrices: None }));
         check(&device, layer_outputs(1, 200, 20, 36, false).0, 3e-3, "halves");

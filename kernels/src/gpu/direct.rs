@@ -36,7 +36,8 @@ pub(super) fn multiply(
     e.b.barrier();
     b.pass(e, tile, stage, one);
     e.b.barrier();
-    let (none, depth) = (e.b.u(0), e.b.u(tile.k));
+    let (none, depth, left) = (e.b.u(0), e.b.u(tile.k), e.b.sub(to, stage));
+    let depth = e.b.math(MathFunction::Min, &[depth, left]);
     let own_k = e.b.open_loop("own_k", none, depth, STEP);
     let k = e.b.add(stage, own_k);
     e.b.topic("a");

@@ -94,7 +94,8 @@ impl Tile {
         let (m, own_m) = match m {
             0..=32 => (32, 4),
             33..=64 => (64, 8),
-            _ => (128, 8),
+            65..=128 => (128, 8),
+            _ => (256, 8),
         };
         let k = k.next_multiple_of(STEP as usize).min(32) as u32;
         Tile { m, n, k, own_m, own_n: n, matrices: None, direct: true }

@@ -167,7 +167,7 @@ impl Explorer {
 
     /// Shows a training view to [`Self::refine`] and [`Self::photo_error`].
     pub(super) fn show_training_view(&mut self, view: usize) -> Result<(), Error> {
-        let lens = self.data.scene.train[view].intrinsics.clone();
+        let lens = self.data.scene.train[view].intrinsics;
         let photo = std::mem::take(&mut self.photos[view]);
         let shown = self.show_view(&lens, &photo);
         self.photos[view] = photo;

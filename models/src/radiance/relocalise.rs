@@ -80,6 +80,7 @@ fn median(values: &[f64]) -> f64 {
 mod tests {
     use super::*;
     use crate::experiment::Experiment;
+    use crate::run::checkpoint::Checkpoint;
     use crate::training::Training;
     use std::sync::Arc;
 
@@ -148,6 +149,11 @@ mod tests {
         assert!(away > 1.5 && left < 0.5 * next, "{away} before, {left} now, {next} to the next camera");
         let after = explorer.poses().unwrap();
         assert!((0..before.len()).all(|i| i == 7 || after[i] == before[i]));
+        // A checkpoint holds where it is now.
+        let tensors = explorer.tensors().unwrap();
+        lose(&mut explorer, 7);
+        explorer.restore(&Checkpoint { step: 400, seconds: 0.0, steps: vec![], tensors }).unwrap();
+        assert_eq!(explorer.poses().unwrap(), after);
     }
 
     #[test]
