@@ -101,8 +101,8 @@ mod tests {
             "radiance.color_layers=[]",
             "optim.lr=5e-3",
             "optim.lr_end=2e-3",
-            "optim.lr_warp=1e-12",
-            "optim.lr_warp_end=1e-12",
+            "optim.lr_warp=1e-4",
+            "optim.lr_warp_end=1e-4",
             "warp.method=global",
             "run.device=cpu",
             "run.threads=1",
@@ -123,6 +123,8 @@ mod tests {
         data.start.poses[view] = away;
         explorer.data = Arc::new(data);
         explorer.place(view, &away).unwrap();
+        let apart = explorer.poses().unwrap()[view].after(&away.inverse());
+        assert!((apart.to_rows().iter().sum::<f64>() - 3.0).abs() < 1e-5, "{apart:?}");
     }
 
     fn displacement(explorer: &mut Explorer, view: usize) -> f64 {
