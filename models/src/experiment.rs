@@ -14,10 +14,11 @@ use crate::config::{ConfigError, DeviceChoice, Layered, Origin, Precision};
 use crate::evaluation::Lpips;
 use crate::planar::{PlanarData, Trainer};
 use crate::radiance::{Explorer, SpaceData};
+use crate::report::median;
 use crate::run::RunFolder;
 use crate::run::checkpoint::Checkpoint;
 use crate::run::metrics::{Entry, Metrics};
-use crate::training::Training;
+use crate::training::{Training, due};
 use crate::warps::{self, Warp};
 use raygrad_runtime::{Device, DeviceError};
 use std::path::{Path, PathBuf};
@@ -300,7 +301,6 @@ impl Experiment {
         stop: &AtomicBool,
     ) -> Result<bool, Error> {
         let (steps, every) = (self.layered.settings.optim.steps, &self.layered.settings.run);
-        let due = |period: usize, done: usize| period > 0 && done.is_multiple_of(period);
         if trainer.steps_done() == 0 && every.picture_every > 0 {
             trainer.write_frame(folder)?;
         }
@@ -351,8 +351,7 @@ fn seconds_per_step(trainer: &mut dyn Training) -> Result<f64, Error> {
         times.push(one()?);
     }
     trainer.restore(&begun)?;
-    times.sort_by(f64::total_cmp);
-    Ok(times[times.len() / 2])
+    Ok(median(&times))
 }
 
 /// What accumulates over a run.

@@ -160,7 +160,7 @@ fn concatenations_of_layers(device: &Device) {
 /// Tiles for drivers in software in all places of a layer, whole and ragged; with `RAYGRAD_NIGHTLY=1` in all of the other tests,
 /// whose kernels take such a driver minutes to compile.
 fn tiles_of_software(device: &Device) {
-    if std::env::var_os("RAYGRAD_NIGHTLY").is_some_and(|v| v == "1") {
+    if raygrad_tests::backend::nightly() {
         [layers_of_all_widths, totals_of_layers, concatenations_of_layers, halves].iter().for_each(|test| test(device));
     }
     layer(device, 2, 333, 34, 64, false);
@@ -172,6 +172,8 @@ fn tiles_of_software(device: &Device) {
     if device.has_half().is_some() {
         let device = device.clone().with_half(Some(Half { matrices: None }));
         check(&device, layer_outputs(1, 200, 20, 36, false).0, 3e-3, "halves");
+    } else {
+        println!("halves skipped: {} has no half precision", device.name());
     }
 }
 

@@ -15,8 +15,12 @@ pub fn devices() -> Vec<Device> {
 /// The devices for tests that compile a hundred kernels or more: on a software driver that takes minutes, so a GPU joins
 /// only where `RAYGRAD_NIGHTLY=1`.
 pub fn devices_for_large_programs() -> Vec<Device> {
-    let nightly = std::env::var_os("RAYGRAD_NIGHTLY").is_some_and(|v| v == "1");
-    devices().into_iter().take(if nightly { usize::MAX } else { 1 }).collect()
+    devices().into_iter().take(if nightly() { usize::MAX } else { 1 }).collect()
+}
+
+/// Whether tests that take minutes run too.
+pub fn nightly() -> bool {
+    std::env::var_os("RAYGRAD_NIGHTLY").is_some_and(|v| v == "1")
 }
 
 /// The best adapter of each backend, which may be software.

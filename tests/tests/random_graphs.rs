@@ -7,7 +7,7 @@
 use raygrad_compiler::plan::region::RegionOp;
 use raygrad_compiler::{Program, StepError, Target, compile};
 use raygrad_runtime::Device;
-use raygrad_tests::backend::{devices_for_large_programs, vulkan, wgpu};
+use raygrad_tests::backend::{devices_for_large_programs, nightly, vulkan, wgpu};
 use raygrad_tests::check::{check, same_bits};
 use raygrad_tests::graphs::{Recipe, shrink};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -15,7 +15,7 @@ use std::sync::Mutex;
 
 /// Large graphs of a run.
 fn large() -> u64 {
-    if std::env::var_os("RAYGRAD_NIGHTLY").is_some() { 10_000 } else { 600 }
+    if nightly() { 10_000 } else { 600 }
 }
 
 /// Graphs of a run that are small enough for a software GPU, which takes half a second each.

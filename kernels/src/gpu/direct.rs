@@ -10,7 +10,7 @@ use super::tile::{Along, Operand, Staged, Tile};
 use naga::{BuiltIn, MathFunction};
 use raygrad_compiler::ops::Reduction;
 
-/// Terms that are added to a sum between reading and writing it.
+/// Terms that are added to a sum between reading and writing it: those that operands give as a vector.
 pub(super) const STEP: u32 = 4;
 
 /// The product as of [`super::tile::multiply`].
@@ -71,7 +71,7 @@ pub(super) fn multiply(
 fn four_terms(e: &mut Emit, tile: Tile, a: &mut Operand, k: Value, i: u32) -> Vec<Value> {
     let m = place(e, e.invocation, i * (tile.m / tile.own_m), 0);
     let mut read = vec![];
-    for j in 0..4 {
+    for j in 0..STEP {
         let (k, m) = if a.along == Along::K { (k, plus(e, m, j)) } else { (plus(e, k, j), m) };
         let value = (a.load)(e, k, m);
         read.push(e.b.splat(value));
@@ -83,7 +83,7 @@ fn four_terms(e: &mut Emit, tile: Tile, a: &mut Operand, k: Value, i: u32) -> Ve
         let lanes = [0, 1, 2, 3].map(|m: usize| e.b.component(read[m], j));
         e.b.vector(lanes)
     };
-    (0..4).map(term).collect()
+    (0..STEP).map(term).collect()
 }
 
 /// Hands out the sums, four columns at a time in a loop.

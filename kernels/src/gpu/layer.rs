@@ -33,7 +33,7 @@ pub(super) fn kernels(
     let several = stretches.len() > 1;
     let rows = row_axes.elements();
     let (mut weights, mut all) = (*weights, vec![]);
-    let multiplied = limits.half.is_some_and(|h| h.matrices.is_some()) && weights.rows.min(weights.columns) > 32;
+    let multiplied = limits.matrices().is_some() && weights.rows.min(weights.columns) > 32;
     if multiplied
         && rows >= MANY_ROWS
         && let Some((halves, kernels)) = halved(layout, limits, name, region, &weights)?

@@ -5,7 +5,7 @@
 //! parts, each in an arena.
 
 use super::LowerError;
-use super::half::{Half, Storage, may_be_half, storages};
+use super::half::{Half, Matrices, Storage, may_be_half, storages};
 use raygrad_compiler::graph::Shape;
 use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::plan::region::BufferId;
@@ -40,6 +40,13 @@ pub const TILES: u32 = 4;
 /// The last of them, tiles for drivers in software: their "invocations" are lanes of a CPU's vectors, which take a value that is
 /// the same for all at once, and values that differ one by one.
 pub const SOFTWARE_TILES: u32 = TILES - 1;
+
+impl Limits {
+    /// Cooperative matrices for tiles; those of drivers in software have none.
+    pub(super) fn matrices(&self) -> Option<Matrices> {
+        self.half.and_then(|h| h.matrices).filter(|_| self.tiles != SOFTWARE_TILES)
+    }
+}
 
 impl Default for Limits {
     /// What WebGPU guarantees.

@@ -47,7 +47,7 @@ impl Tile {
             return Tile::direct(m, n, k);
         }
         let skipped = limits.tiles as usize;
-        if let Some(matrices) = limits.half.and_then(|h| h.matrices)
+        if let Some(matrices) = limits.matrices()
             && n > 32
             && k >= 16
         {
@@ -269,8 +269,7 @@ impl<'a> Staged<'a> {
         e.if_below(number, partly.then_some(vectors), |e| {
             let (own_k, at) = self.locate(e, tile, number);
             let k = e.b.add(first, own_k);
-            let value = (self.operand.load)(e, k, at);
-            let value = e.b.splat(value);
+            let value = self.read(e, k, at);
             self.write(e, own_k, at, value);
         });
         e.b.close_loop();
@@ -280,11 +279,15 @@ impl<'a> Staged<'a> {
     fn fetch(&mut self, e: &mut Emit, tile: Tile, first: Value) {
         self.each(e, tile, |own, e, i, k, at| {
             let k = e.b.add(first, k);
-            let value = (own.operand.load)(e, k, at);
-            let value = e.b.splat(value);
+            let value = own.read(e, k, at);
             let value = if tile.matrices.is_some() { e.b.half(value) } else { value };
             e.b.set(own.fetched[i], value);
         });
+    }
+
+    fn read(&mut self, e: &mut Emit, k: Value, at: Value) -> Value {
+        let value = (self.operand.load)(e, k, at);
+        e.b.splat(value)
     }
 
     /// Into workgroup memory.

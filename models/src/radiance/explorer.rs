@@ -2,17 +2,17 @@
 
 use super::data::{SpaceData, SpaceDataError};
 use super::model::{self, RadianceModel, nothing_found};
-use super::relocalise::{Relocalised, relocalise};
+use super::relocalise::relocalise;
 use super::results;
 use crate::Error;
 use crate::config::{DepthSettings, Layered, Method, Settings};
 use crate::evaluation::{Evaluation, Lpips, Metric, Stage};
 use crate::geometry::Pose;
-use crate::run::RunFolder;
-use crate::run::metrics::{Entry, Final, Measured, Metrics};
+use crate::run::metrics::{Entry, Final, Measured, Metrics, Relocalised};
+use crate::run::{Checkpoint, RunFolder};
 use crate::scene::{Intrinsics, View};
 use crate::training::learner::psnr;
-use crate::training::{Learner, Training};
+use crate::training::{Learner, Training, due};
 use crate::warps::Warp;
 use raygrad_compiler::functions::adam::Adam;
 use raygrad_runtime::{Device, ProgramId};
@@ -42,7 +42,7 @@ pub struct Explorer {
     view_pixels: usize,
     rays: usize,
     /// Cameras brought back since the last measurement.
-    relocalised: Vec<Relocalised>,
+    pub(super) relocalised: Vec<Relocalised>,
     /// Packed pixels of the training views, where lost cameras are looked for.
     photos: Vec<Vec<u32>>,
     /// Once training has ended.
@@ -79,7 +79,7 @@ impl Explorer {
         learner.set(model::FOUND, &nothing_found(views))?;
         let intrinsics: Vec<f32> = data.scene.train.iter().flat_map(|v| lens(&v.intrinsics)).collect();
         learner.set(model::INTRINSICS, &intrinsics)?;
-        let relocalises = settings.train.as_ref().is_some_and(|t| t.relocalise_every > 0);
+        let relocalises = relocalise_every(settings) > 0;
         let mut photos = vec![];
         // From here on the images live on the device.
         for (i, view) in data.scene.train.iter_mut().enumerate() {
@@ -141,7 +141,7 @@ impl Explorer {
     /// `pose` after test-time refinement against a view's image.
     pub fn refined(&mut self, pose: &Pose, view: &View) -> Result<Pose, Error> {
         let steps = self.settings.train.as_ref().map_or(0, |t| t.refine_steps);
-        self.show_view(&view.intrinsics, &model::packed(view).collect::<Vec<_>>())?;
+        show(&mut self.learner, &view.intrinsics, &model::packed(view).collect::<Vec<_>>())?;
         self.refine(pose, steps, self.settings.optim.lr_warp)
     }
 
@@ -167,11 +167,7 @@ impl Explorer {
 
     /// Shows a training view to [`Self::refine`] and [`Self::photo_error`].
     pub(super) fn show_training_view(&mut self, view: usize) -> Result<(), Error> {
-        let lens = self.data.scene.train[view].intrinsics;
-        let photo = std::mem::take(&mut self.photos[view]);
-        let shown = self.show_view(&lens, &photo);
-        self.photos[view] = photo;
-        shown
+        show(&mut self.learner, &self.data.scene.train[view].intrinsics, &self.photos[view])
     }
 
     /// Mean squared error of the image that is shown against what the model shows at `pose`; over the same pixels for all poses.
@@ -213,11 +209,6 @@ impl Explorer {
         Ok(found)
     }
 
-    fn show_view(&mut self, camera: &Intrinsics, photo: &[u32]) -> Result<(), Error> {
-        self.learner.set(model::VIEW_INTRINSICS, &lens(camera))?;
-        self.learner.set_u32(model::VIEW_IMAGE, photo)
-    }
-
     fn set_pose(&mut self, pose: &Pose) -> Result<(), Error> {
         self.learner.set(model::VIEW_POSE, &flat_rows(&[*pose]))?;
         if self.settings.train.as_ref().is_some_and(|t| t.depth == DepthSettings::Auto) {
@@ -228,6 +219,18 @@ impl Explorer {
         }
         Ok(())
     }
+}
+
+/// Steps between two searches for lost cameras; known poses are not lost.
+fn relocalise_every(settings: &Settings) -> usize {
+    let every = settings.train.as_ref().map_or(0, |t| t.relocalise_every);
+    if settings.warp.method == Method::None { 0 } else { every }
+}
+
+/// Sets the lens and the photo of a view.
+fn show(learner: &mut Learner, camera: &Intrinsics, photo: &[u32]) -> Result<(), Error> {
+    learner.set(model::VIEW_INTRINSICS, &lens(camera))?;
+    learner.set_u32(model::VIEW_IMAGE, photo)
 }
 
 /// `[R | t]` of poses, row by row.
@@ -252,14 +255,15 @@ impl Training for Explorer {
     }
     fn step(&mut self) -> Result<(), Error> {
         self.learner.train(self.train)?;
-        // Known poses are not lost.
-        let known = self.settings.warp.method == Method::None;
-        let every = self.settings.train.as_ref().map_or(0, |t| t.relocalise_every);
-        if every > 0 && !known && self.steps_done().is_multiple_of(every) {
+        if due(relocalise_every(&self.settings), self.steps_done()) {
             let back = relocalise(self)?;
             self.relocalised.extend(back);
         }
         Ok(())
+    }
+    fn restore(&mut self, checkpoint: &Checkpoint) -> Result<(), Error> {
+        self.relocalised.clear();
+        self.learner.restore(checkpoint)
     }
     fn measure(&mut self) -> Result<Entry, Error> {
         let loss = self.learner.losses(self.train)?;

@@ -16,4 +16,3 @@ pub use data::SpaceData;
 pub use explorer::{Explorer, Rendered};
 pub use model::{NotInSpace, RadianceModel};
 pub use novel_views::NovelViews;
-pub use relocalise::Relocalised;

@@ -12,7 +12,8 @@
 use super::explorer::Explorer;
 use crate::Error;
 use crate::geometry::Pose;
-use serde::{Deserialize, Serialize};
+use crate::report::median;
+use crate::run::metrics::Relocalised;
 
 /// A camera is lost whose photo's mean squared error is so many times the median over all cameras.
 const LOST: f64 = 2.5;
@@ -23,15 +24,6 @@ const REFINED: usize = 3;
 /// Steps of a refinement, and Adam's rate: far enough for the way to the next camera.
 const STEPS: usize = 100;
 const RATE: f64 = 1e-2;
-
-/// A camera that was brought back.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Relocalised {
-    pub view: String,
-    /// Mean squared error of its photo where it was, and where it is now.
-    pub error_before: f64,
-    pub error_after: f64,
-}
 
 /// Looks for lost cameras and brings them back.
 pub fn relocalise(explorer: &mut Explorer) -> Result<Vec<Relocalised>, Error> {
@@ -68,12 +60,6 @@ pub fn relocalise(explorer: &mut Explorer) -> Result<Vec<Relocalised>, Error> {
         }
     }
     Ok(back)
-}
-
-fn median(values: &[f64]) -> f64 {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    sorted.get(sorted.len() / 2).copied().unwrap_or(0.0)
 }
 
 #[cfg(test)]
@@ -154,8 +140,10 @@ mod tests {
         // A checkpoint holds where it is now.
         let tensors = explorer.tensors().unwrap();
         lose(&mut explorer, 7);
+        explorer.relocalised = back;
         explorer.restore(&Checkpoint { step: 400, seconds: 0.0, steps: vec![], tensors }).unwrap();
         assert_eq!(explorer.poses().unwrap(), after);
+        assert_eq!(explorer.relocalised, [], "what happened after it did not happen");
     }
 
     #[test]

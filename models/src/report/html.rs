@@ -179,6 +179,13 @@ impl Report<'_> {
     }
 }
 
+/// The middle one of some numbers, of two the larger; 0 of none.
+pub fn median(values: &[f64]) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted.get(sorted.len() / 2).copied().unwrap_or(0.0)
+}
+
 /// 75 seconds as `1:15 min`.
 pub fn duration(seconds: f64) -> String {
     let whole = seconds.round() as u64;

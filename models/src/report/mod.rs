@@ -3,5 +3,5 @@
 mod html;
 mod plots;
 
-pub use html::{Picture, Report, duration};
+pub use html::{Picture, Report, duration, median};
 pub use plots::{Curve, PlotError, plot};

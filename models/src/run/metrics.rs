@@ -1,6 +1,5 @@
 //! `metrics.json`: what was measured, per logged step and at the end.
 
-use crate::radiance::Relocalised;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -16,6 +15,15 @@ pub struct Entry {
     /// Cameras brought back since the last entry, see `train.relocalise_every`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub relocalised: Vec<Relocalised>,
+}
+
+/// A camera that was brought back.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Relocalised {
+    pub view: String,
+    /// Mean squared error of its photo where it was, and where it is now.
+    pub error_before: f64,
+    pub error_after: f64,
 }
 
 /// What is measured besides the losses.

@@ -8,4 +8,4 @@ pub mod results;
 
 pub use checkpoint::{Checkpoint, CheckpointError};
 pub use folder::{FolderError, RunFolder};
-pub use metrics::{Entry, Final, Measured, Metrics};
+pub use metrics::{Entry, Final, Measured, Metrics, Relocalised};

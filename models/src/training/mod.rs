@@ -17,6 +17,11 @@ use crate::run::{RunFolder, checkpoint::Saved};
 use raygrad_runtime::ProgramId;
 use std::collections::BTreeMap;
 
+/// Whether something that happens every `period` steps does so after `done`; never at 0.
+pub fn due(period: usize, done: usize) -> bool {
+    period > 0 && done.is_multiple_of(period)
+}
+
 /// An experiment in training, as a run sees it.
 pub trait Training {
     fn learner(&self) -> &Learner;

@@ -3,6 +3,7 @@
 use crate::{Choice, print};
 use clap::Args;
 use raygrad::config::{ConfigError, Count};
+use raygrad::report::median;
 use raygrad::training::Training;
 use raygrad_compiler::Program;
 use raygrad_runtime::Device;
@@ -121,7 +122,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
     if let Some(file) = &args.trace {
         write_trace(file, program, &of_lanes, &profiled)?;
     }
-    let seconds = median(&mut times);
+    let seconds = median(&times);
     let gflop = trainer.flops() / 1e9;
     let result = Result {
         preset: args.choice.preset.clone(),
@@ -171,12 +172,7 @@ fn host_seconds(trainer: &mut dyn Training) -> anyhow::Result<f64> {
         }
         trainer.wait()?;
     }
-    Ok(median(&mut times))
-}
-
-fn median(values: &mut [f64]) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(0.0)
+    Ok(median(&times))
 }
 
 /// Seconds of every launch of some steps.
@@ -198,7 +194,7 @@ fn profile(trainer: &mut dyn Training) -> anyhow::Result<Vec<Vec<f64>>> {
 fn launches(program: &Program, of_lanes: &[u64], profiled: &[Vec<f64>]) -> Vec<Launch> {
     let one = |(i, launch): (usize, &raygrad_compiler::plan::Launch)| Launch {
         name: launch.name.clone(),
-        seconds: median(&mut profiled.iter().map(|step| step[i]).collect::<Vec<_>>()),
+        seconds: median(&profiled.iter().map(|step| step[i]).collect::<Vec<_>>()),
         gflop: launch.region.flops() as f64 * 1e-9,
         gbytes: program.launch_bytes_of(i, |b| of_lanes[b.0 as usize]) as f64 * 1e-9,
     };
