@@ -81,6 +81,18 @@ fn an_interrupted_run_resumes_bit_by_bit_with_every_method() {
 }
 
 #[test]
+fn searches_that_find_no_lost_camera_leave_a_run_as_it_is() {
+    let dir = tempfile::tempdir().unwrap();
+    let bits = |every: usize| {
+        let run = dir.path().join(every.to_string());
+        let outcome = tiny(&[&format!("train.relocalise_every={every}")], &run).train().unwrap();
+        assert!(outcome.metrics.steps.iter().all(|e| e.relocalised.is_empty()));
+        std::fs::read(run.join(format!("checkpoint-{STEPS:07}.safetensors"))).unwrap()
+    };
+    assert!(bits(0) == bits(3));
+}
+
+#[test]
 fn a_finished_run_that_is_resumed_keeps_its_numbers() {
     let dir = tempfile::tempdir().unwrap();
     let run = dir.path().join("run");
