@@ -193,6 +193,8 @@ mod tests {
         example().save(dir.path()).unwrap();
         assert!(error(&BTreeMap::from([("w".to_string(), vec![3, 3])])).contains("shape [2, 3], expected [3, 3]"));
         assert!(error(&BTreeMap::new()).contains("this model has no `w`"));
+        let more = BTreeMap::from([("w".to_string(), vec![2, 3]), ("v".to_string(), vec![1])]);
+        assert!(error(&more).contains("checkpoint-0000012.safetensors does not belong to this model: it lacks `v`"));
         let tensors = dir.path().join("checkpoint-0000012.safetensors");
         let bytes = std::fs::read(&tensors).unwrap();
         std::fs::write(&tensors, &bytes[..bytes.len() - 5]).unwrap();
