@@ -1,5 +1,5 @@
 //! Speed of the CPU kernels on one thread: matrix kernels in per cent of the multiply-add peak that is measured right
-//! before and after, functions in nanoseconds per value.
+//! before and after, functions in nanoseconds per value. Products are those of floats, and of bfloat16 pairs.
 //!
 //! `cargo run --release -p raygrad-kernels --example gemm_peak [-- <seconds per case> <instruction set>]`
 use raygrad_compiler::scalar::Prim;
@@ -31,15 +31,15 @@ fn batch(f: impl FnMut(usize)) -> usize {
 }
 
 /// Prints quartiles of many short measurements, each relative to the peak right before and after it.
-fn report(name: &str, flops: f64, seconds: f64, mut f: impl FnMut(usize)) {
+fn report(name: &str, products: Products, flops: f64, seconds: f64, mut f: impl FnMut(usize)) {
     // Shorter than a scheduler's time slice, so that most windows see no other process.
     const WINDOW: f64 = 1e-3;
     let batch = batch(&mut f);
-    let mut before = peak_gflops(1, WINDOW * 1e3);
+    let mut before = peak_gflops(products, 1, WINDOW * 1e3);
     let mut percent: Vec<f64> = (0..(seconds / WINDOW) as usize + 4)
         .map(|_| {
             let rate = flops / time(WINDOW, batch, &mut f) * 1e-9;
-            let after = peak_gflops(1, WINDOW * 1e3);
+            let after = peak_gflops(products, 1, WINDOW * 1e3);
             rate / (0.5 * (std::mem::replace(&mut before, after) + after)) * 100.0
         })
         .collect();
@@ -61,17 +61,22 @@ fn filled(len: usize) -> AlignedVec {
     v
 }
 
-fn matrix_kernels(isa: Isa, k: usize, n: usize, rows: usize, seconds: f64) {
+fn matrix_kernels(isa: Isa, products: Products, [k, n, rows]: [usize; 3], seconds: f64) {
     let ld = row_stride(rows);
     let (x, mut y, bias) = (filled(k * ld), filled(n * ld), filled(n));
-    let panels = filled(panel_len(k, n) * SETS);
+    let weights = panel_len(products.lanes(k), n);
+    let panels = filled(weights * SETS);
+    let mut scratch = AlignedVec::zeroed(gemm_scratch(products, k).max(outer_scratch(products, k, n, rows)));
+    let scratch = scratch.as_mut_ptr();
     let flops = 2.0 * (k * n * rows) as f64;
-    report(&format!("{isa} gemm {k}x{n}, {rows} rows"), flops, seconds, |i| {
+    report(&format!("{isa} {products:?} gemm {k}x{n}, {rows} rows"), products, flops, seconds, |i| {
         let args = Gemm {
             x: x.as_ptr(),
             ldx: ld,
             contraction: k,
-            panels: panels[i % SETS * panel_len(k, n)..].as_ptr(),
+            products,
+            scratch,
+            panels: panels[i % SETS * weights..].as_ptr(),
             outputs: n,
             bias: bias.as_ptr(),
             accumulate: false,
@@ -84,10 +89,11 @@ fn matrix_kernels(isa: Isa, k: usize, n: usize, rows: usize, seconds: f64) {
         unsafe { gemm(isa, args) }
     });
     let mut g = AlignedVec::zeroed(outer_len(k, n) * SETS);
-    report(&format!("{isa} outer {k}x{n}, {rows} rows"), flops, seconds, |i| {
+    report(&format!("{isa} {products:?} outer {k}x{n}, {rows} rows"), products, flops, seconds, |i| {
         let g = g[i % SETS * outer_len(k, n)..].as_mut_ptr();
         let d = y.as_ptr();
-        let args = Outer { x: x.as_ptr(), ldx: ld, k, first: 0, channels: k, d, ldd: ld, n, rows, g };
+        let args =
+            Outer { products, scratch, x: x.as_ptr(), ldx: ld, k, first: 0, channels: k, d, ldd: ld, n, rows, g };
         // SAFETY: as above.
         unsafe { outer(isa, args) }
     });
@@ -115,11 +121,18 @@ fn functions(isa: Isa, len: usize, seconds: f64) {
 
 fn main() {
     let seconds = std::env::args().nth(1).and_then(|s| s.parse().ok()).unwrap_or(0.15);
-    println!("peak of one thread: {:.1} GFLOP/s ({})", peak_gflops(1, 200.0), Isa::detect());
+    let all = [Products::F32, Products::Bf16];
+    for products in all {
+        println!(
+            "peak of one thread: {:.1} GFLOP/s ({}, {products:?})",
+            peak_gflops(products, 1, 200.0),
+            Isa::detect()
+        );
+    }
     let only = std::env::args().nth(2);
     for isa in Isa::available().into_iter().filter(|isa| only.as_ref().is_none_or(|name| isa.to_string() == *name)) {
-        for (k, n, rows) in [(256, 256, 192), (256, 256, 96), (34, 256, 192), (64, 64, 192), (256, 3, 192)] {
-            matrix_kernels(isa, k, n, rows, seconds);
+        for sizes in [[256, 256, 192], [256, 256, 96], [34, 256, 192], [64, 64, 192], [256, 3, 192]] {
+            all.into_iter().for_each(|products| matrix_kernels(isa, products, sizes, seconds));
         }
         for len in [64, 192, 1024] {
             functions(isa, len, seconds);

@@ -16,11 +16,12 @@ const LANES: usize = 16 << 20;
 const ROUNDS: usize = 5;
 
 impl Device {
-    /// 10^9 operations a second of multiply-adds in registers, each counted as two; on the CPU on as many threads as it has.
+    /// 10^9 operations a second of multiply-adds in registers, each counted as two; on the CPU on as many threads as it has,
+    /// and of what its matrix products multiply.
     /// Takes some tenths of a second.
     pub fn peak_gflops(&self) -> Result<f64, RunError> {
         match self {
-            Device::Cpu { pool } => Ok(peak_gflops(pool.current_num_threads(), 150.0)),
+            Device::Cpu { pool, products } => Ok(peak_gflops(*products, pool.current_num_threads(), 150.0)),
             #[cfg(feature = "gpu")]
             _ => self.rate(gpu::multiply_adds()),
         }

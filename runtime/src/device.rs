@@ -2,7 +2,7 @@
 
 use crate::{DeviceError, RunError};
 use raygrad_compiler::{Program, Target};
-use raygrad_kernels::cpu::Isa;
+use raygrad_kernels::cpu::{Isa, Products};
 #[cfg(feature = "gpu")]
 use raygrad_kernels::gpu::{Half, SOFTWARE_TILES, storages};
 use std::sync::Arc;
@@ -10,8 +10,8 @@ use std::sync::Arc;
 /// A device to run sessions on.
 #[derive(Clone)]
 pub enum Device {
-    /// The CPU, with a pool of its own threads.
-    Cpu { pool: Arc<rayon::ThreadPool> },
+    /// The CPU, with a pool of its own threads, and what its matrix products multiply.
+    Cpu { pool: Arc<rayon::ThreadPool>, products: Products },
     /// A GPU, or software that acts as one.
     #[cfg(feature = "wgpu")]
     Wgpu { gpu: Arc<crate::wgpu::Gpu>, forms: Forms },
@@ -44,8 +44,8 @@ pub enum Precision {
     /// Everything in single precision.
     #[default]
     F32,
-    /// Matrix products of halves, summed in single precision; what they read is stored as halves. Parameters, coordinates
-    /// and everything else stay in single precision.
+    /// Matrix products of halves, summed in single precision. Parameters and everything else stay in single precision.
+    /// A GPU stores what they read as halves (f16); the CPU rounds it to bfloat16 where they read it.
     Mixed,
 }
 
@@ -114,21 +114,22 @@ impl Device {
         };
         let builder = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(|i| format!("raygrad-{i}"));
         let pool = builder.build().map_err(|e| DeviceError::Threads { threads, reason: e.to_string() })?;
-        Ok(Device::Cpu { pool: Arc::new(pool) })
+        Ok(Device::Cpu { pool: Arc::new(pool), products: Products::F32 })
     }
 
-    /// The same device at another precision. Cooperative matrices are used where the device has them and they pass a test
-    /// against single precision.
+    /// The same device at another precision. Cooperative matrices are used where a GPU has them and they pass a test
+    /// against single precision. A CPU without dot products of bfloat16 computes the same from single precision, which
+    /// takes longer than [`Precision::F32`].
     pub fn with_precision(self, precision: Precision) -> Result<Device, DeviceError> {
-        match (precision, &self) {
-            (Precision::F32, Device::Cpu { .. }) => Ok(self),
-            (Precision::Mixed, Device::Cpu { .. }) => Err(DeviceError::NoHalf { device: self.name() }),
+        match (precision, self) {
+            (Precision::F32, Device::Cpu { pool, .. }) => Ok(Device::Cpu { pool, products: Products::F32 }),
+            (Precision::Mixed, Device::Cpu { pool, .. }) => Ok(Device::Cpu { pool, products: Products::Bf16 }),
             #[cfg(feature = "gpu")]
-            (Precision::F32, _) => Ok(self.with_half(None)),
+            (Precision::F32, gpu) => Ok(gpu.with_half(None)),
             #[cfg(feature = "gpu")]
-            (Precision::Mixed, _) => {
-                let Some(half) = self.has_half() else { return Err(DeviceError::NoHalf { device: self.name() }) };
-                let mixed = self.with_half(Some(half));
+            (Precision::Mixed, gpu) => {
+                let Some(half) = gpu.has_half() else { return Err(DeviceError::NoHalf { device: gpu.name() }) };
+                let mixed = gpu.with_half(Some(half));
                 if half.matrices.is_none() || crate::gpu::half::matrices_work(&mixed) {
                     return Ok(mixed);
                 }
@@ -227,7 +228,14 @@ impl Device {
     /// The device, for people.
     pub fn name(&self) -> String {
         match self {
-            Device::Cpu { pool } => format!("CPU, {} threads", pool.current_num_threads()),
+            Device::Cpu { pool, products } => {
+                let form = match products {
+                    Products::F32 => "",
+                    Products::Bf16 if Isa::detect() == Isa::Avx512Bf16 => ", bf16 products",
+                    Products::Bf16 => ", bf16 products emulated (slower than f32)",
+                };
+                format!("CPU, {} threads{form}", pool.current_num_threads())
+            }
             #[cfg(feature = "wgpu")]
             Device::Wgpu { gpu, .. } => gpu.adapter().name.clone(),
             #[cfg(feature = "vulkan")]

@@ -50,7 +50,7 @@ impl Session {
     /// An empty session on `device`.
     pub fn new(device: Device) -> Result<Session, RunError> {
         let executor: Box<dyn Executor> = match device {
-            Device::Cpu { pool } => Box::new(CpuExecutor::new(pool)),
+            Device::Cpu { pool, products } => Box::new(CpuExecutor::new(pool, products)),
             #[cfg(feature = "wgpu")]
             Device::Wgpu { gpu, forms } => Box::new(GpuExecutor::new(crate::wgpu::WgpuApi::new(gpu), forms)),
             #[cfg(feature = "vulkan")]

@@ -5,8 +5,9 @@
 //! registers while the others pass. Row blocks are the outer loop, so that the slab of `x` that a block reads stays in
 //! the L1 cache while the panels stream through.
 use super::panels::{PANEL, panel_len};
+use super::products::{Channels, Multiply, Pairs, Singles};
 use super::simd::{Kernel, Simd, launch};
-use super::{Isa, ROW_BLOCK};
+use super::{Isa, Products, ROW_BLOCK};
 
 /// What happens to a finished output.
 #[derive(Clone, Copy, Debug)]
@@ -28,7 +29,11 @@ pub struct Gemm {
     pub x: *const f32,
     pub ldx: usize,
     pub contraction: usize,
-    /// Packed by [`super::pack_panels`].
+    /// What is multiplied.
+    pub products: Products,
+    /// [`gemm_scratch`] lanes, which the kernel may write.
+    pub scratch: *mut f32,
+    /// Packed by [`super::pack_panels`] for the same products.
     pub panels: *const f32,
     pub outputs: usize,
     /// One value per output, or null for zeros.
@@ -41,6 +46,14 @@ pub struct Gemm {
     pub ldy: usize,
     /// A multiple of [`ROW_BLOCK`].
     pub rows: usize,
+}
+
+/// Lanes of scratch that a product of `contraction` channels takes: a block of rows of the operand in pairs.
+pub fn gemm_scratch(products: Products, contraction: usize) -> usize {
+    match products {
+        Products::F32 => 0,
+        Products::Bf16 => products.lanes(contraction) * ROW_BLOCK,
+    }
 }
 
 /// Computes the product.
@@ -56,30 +69,49 @@ pub unsafe fn gemm(isa: Isa, args: Gemm) {
 
 impl Kernel for Gemm {
     type Out = ();
+    const PAIRS: bool = true;
 
     #[inline(always)]
     unsafe fn run<S: Simd>(&self) {
-        // SAFETY: forwarded contract. `NV * LANES` divides `ROW_BLOCK`.
+        // SAFETY: forwarded contract.
         unsafe {
-            match S::REGISTERS {
-                32.. => self.blocks::<S, 8, 2>(),
-                16.. => self.blocks::<S, 3, 4>(),
-                _ => self.blocks::<S, 2, 2>(),
+            match self.products {
+                Products::F32 => self.run_with::<S, Singles>(),
+                Products::Bf16 => self.run_with::<S, Pairs>(),
             }
         }
     }
 }
 
 impl Gemm {
+    /// # Safety
+    /// As [`gemm`].
+    #[inline(always)]
+    unsafe fn run_with<S: Simd, P: Multiply<S>>(&self) {
+        // SAFETY: forwarded contract. `NV * LANES` divides `ROW_BLOCK`.
+        unsafe {
+            match S::REGISTERS {
+                32.. => self.blocks::<S, P, 8, 2>(),
+                16.. => self.blocks::<S, P, 3, 4>(),
+                _ => self.blocks::<S, P, 2, 2>(),
+            }
+        }
+    }
+
     /// All blocks of `MR` outputs and `NV` vectors, fewer outputs where a panel or the outputs end.
     ///
     /// # Safety
     /// As [`gemm`], and `NV * S::LANES` divides `rows`.
     #[inline(always)]
-    unsafe fn blocks<S: Simd, const MR: usize, const NV: usize>(&self) {
-        let panel_size = panel_len(self.contraction, PANEL);
+    unsafe fn blocks<S: Simd, P: Multiply<S>, const MR: usize, const NV: usize>(&self) {
+        let panel_size = panel_len(P::PRODUCTS.lanes(self.contraction), PANEL);
         let mut row = 0;
         while row < self.rows {
+            // SAFETY: every channel has a block of rows here, and the scratch has room for one.
+            let x = unsafe {
+                let channels = Channels { at: self.x.add(row), ld: self.ldx, count: self.contraction };
+                P::over_channels::<NV>(channels, self.scratch)
+            };
             let mut output = 0;
             while output < self.outputs {
                 let count = MR.min(self.outputs - output).min(PANEL - output % PANEL);
@@ -88,15 +120,15 @@ impl Gemm {
                 unsafe {
                     let panel = self.panels.add(output / PANEL * panel_size + output % PANEL);
                     match count {
-                        1 => self.block::<S, 1, NV>(panel, output, row),
-                        2 => self.block::<S, 2, NV>(panel, output, row),
-                        3 => self.block::<S, 3, NV>(panel, output, row),
+                        1 => self.block::<S, P, 1, NV>(x, panel, output, row),
+                        2 => self.block::<S, P, 2, NV>(x, panel, output, row),
+                        3 => self.block::<S, P, 3, NV>(x, panel, output, row),
                         // Guarded, so that narrow kernels do not compile blocks that they never need.
-                        4 if MR > 4 => self.block::<S, 4, NV>(panel, output, row),
-                        5 if MR > 4 => self.block::<S, 5, NV>(panel, output, row),
-                        6 if MR > 4 => self.block::<S, 6, NV>(panel, output, row),
-                        7 if MR > 4 => self.block::<S, 7, NV>(panel, output, row),
-                        _ => self.block::<S, MR, NV>(panel, output, row),
+                        4 if MR > 4 => self.block::<S, P, 4, NV>(x, panel, output, row),
+                        5 if MR > 4 => self.block::<S, P, 5, NV>(x, panel, output, row),
+                        6 if MR > 4 => self.block::<S, P, 6, NV>(x, panel, output, row),
+                        7 if MR > 4 => self.block::<S, P, 7, NV>(x, panel, output, row),
+                        _ => self.block::<S, P, MR, NV>(x, panel, output, row),
                     }
                 }
                 output += count;
@@ -110,8 +142,14 @@ impl Gemm {
     /// # Safety
     /// As [`gemm`]; the block lies inside `y`, and `panel` points to the weights of its first output.
     #[inline(always)]
-    unsafe fn block<S: Simd, const MR: usize, const NV: usize>(&self, panel: *const f32, output: usize, row: usize) {
-        // SAFETY: every access is channel `< contraction` of `x`, or output `output + i` of `bias`, `y` and `h`, at
+    unsafe fn block<S: Simd, P: Multiply<S>, const MR: usize, const NV: usize>(
+        &self,
+        x: Channels,
+        panel: *const f32,
+        output: usize,
+        row: usize,
+    ) {
+        // SAFETY: every access is step `< count` of `x`, or output `output + i` of `bias`, `y` and `h`, at
         // vector `j` of the block's rows: inside by the contract. `panel + c * PANEL + i` stays in the panel because
         // `output % PANEL + MR <= PANEL`.
         unsafe {
@@ -122,34 +160,34 @@ impl Gemm {
                     acc[i] = [S::splat(*self.bias.add(output + i)); NV];
                 }
             }
-            let mut x = self.x.add(row);
+            let Channels { mut at, ld, count } = x;
             let mut weights = panel;
-            for _ in 0..self.contraction {
+            for _ in 0..count {
                 if NV > MR {
                     let mut ws = [zero; MR];
                     for i in 0..MR {
                         ws[i] = S::splat(*weights.add(i));
                     }
                     for j in 0..NV {
-                        let v = S::load(x.add(j * S::LANES));
+                        let v = S::load(at.add(j * S::LANES));
                         for i in 0..MR {
-                            acc[i][j] = S::fma(ws[i], v, acc[i][j]);
+                            acc[i][j] = P::multiply_add(ws[i], v, acc[i][j]);
                         }
                     }
                 } else {
                     let mut xs = [zero; NV];
                     for j in 0..NV {
-                        xs[j] = S::load(x.add(j * S::LANES));
+                        xs[j] = S::load(at.add(j * S::LANES));
                     }
                     for i in 0..MR {
                         let w = S::splat(*weights.add(i));
                         for j in 0..NV {
-                            acc[i][j] = S::fma(w, xs[j], acc[i][j]);
+                            acc[i][j] = P::multiply_add(w, xs[j], acc[i][j]);
                         }
                     }
                 }
                 // `wrapping_add`: after the last step the pointer may lie beyond the end of the tile.
-                x = x.wrapping_add(self.ldx);
+                at = at.wrapping_add(ld);
                 weights = weights.wrapping_add(PANEL);
             }
             self.finish::<S, MR, NV>(&mut acc, output, row);

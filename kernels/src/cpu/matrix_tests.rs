@@ -1,6 +1,19 @@
 //! The matrix kernels and reductions against `f64` loops, for odd shapes on every instruction set.
 use super::*;
 
+/// Every instruction set with everything that it can multiply.
+fn forms() -> impl Iterator<Item = (Isa, Products)> {
+    Isa::available().into_iter().flat_map(|isa| [(isa, Products::F32), (isa, Products::Bf16)])
+}
+
+/// What a product takes an operand for.
+fn rounded(products: Products, x: f32) -> f64 {
+    match products {
+        Products::F32 => x as f64,
+        Products::Bf16 => half::bf16::from_f32(x).to_f64(),
+    }
+}
+
 const SIZES: [usize; 8] = [1, 2, 3, 5, 34, 63, 256, 257];
 const ROWS: [usize; 4] = [32, 64, 96, 192];
 
@@ -45,11 +58,20 @@ impl GemmCase {
     }
 
     /// Runs the kernel with the weights as `[contraction][outputs]` or transposed; `in_place` masks `y` by itself.
-    fn run(&self, isa: Isa, transposed: bool, bias: bool, accumulate: bool, epilogue: &str) -> AlignedVec {
+    fn run(
+        &self,
+        (isa, products): (Isa, Products),
+        transposed: bool,
+        bias: bool,
+        accumulate: bool,
+        epilogue: &str,
+    ) -> AlignedVec {
         let (c, o) = (self.contraction, self.outputs);
-        let mut panels = AlignedVec::zeroed(panel_len(c, o));
+        let mut panels = AlignedVec::zeroed(panel_len(products.lanes(c), o));
+        let mut scratch = AlignedVec::zeroed(gemm_scratch(products, c) + 1);
+        *scratch.last_mut().unwrap() = CANARY;
         let (k, n) = if transposed { (o, c) } else { (c, o) };
-        pack_panels(&self.w, k, n, transposed, &mut panels);
+        pack_panels(products, &self.w, k, n, transposed, &mut panels);
         let mut y = self.h.clone();
         for row in y.chunks_exact_mut(self.ldy) {
             row[self.rows..].fill(CANARY);
@@ -64,6 +86,8 @@ impl GemmCase {
             x: self.x.as_ptr(),
             ldx: self.ldx,
             contraction: c,
+            products,
+            scratch: scratch.as_mut_ptr(),
             panels: panels.as_ptr(),
             outputs: o,
             bias: if bias { self.bias.as_ptr() } else { std::ptr::null() },
@@ -75,18 +99,19 @@ impl GemmCase {
         };
         // SAFETY: `isa` is available, and the buffers have the shapes given.
         unsafe { gemm(isa, args) };
+        assert_eq!(scratch.last(), Some(&CANARY), "stray write");
         y
     }
 
-    fn check(&self, y: &[f32], transposed: bool, bias: bool, accumulate: bool, epilogue: &str) {
+    fn check(&self, y: &[f32], products: Products, transposed: bool, bias: bool, accumulate: bool, epilogue: &str) {
         let (c, o) = (self.contraction, self.outputs);
         let mut sums = vec![0.0f64; self.rows];
         for j in 0..o {
             sums.fill(if bias { self.bias[j] as f64 } else { 0.0 });
             for i in 0..c {
-                let w = self.w[if transposed { j * c + i } else { i * o + j }] as f64;
+                let w = rounded(products, self.w[if transposed { j * c + i } else { i * o + j }]);
                 for (sum, &x) in sums.iter_mut().zip(&self.x[i * self.ldx..]) {
-                    *sum += w * x as f64;
+                    *sum += w * rounded(products, x);
                 }
             }
             for (r, sum) in sums.iter().enumerate() {
@@ -108,14 +133,14 @@ impl GemmCase {
 
 #[test]
 fn gemm_matches_f64() {
-    for isa in Isa::available() {
+    for form in forms() {
         for (i, contraction) in SIZES.into_iter().enumerate() {
             for (j, outputs) in partners(contraction).enumerate() {
                 let case = GemmCase::new(contraction, outputs, ROWS[(i + j) % 4]);
                 let epilogue = ["none", "relu", "mask", "in place"][(i + 2 * j) % 4];
                 let (transposed, bias, accumulate) = (j % 2 == 1, i % 2 == 0, (i + j) % 3 == 0);
-                let y = case.run(isa, transposed, bias, accumulate, epilogue);
-                case.check(&y, transposed, bias, accumulate, epilogue);
+                let y = case.run(form, transposed, bias, accumulate, epilogue);
+                case.check(&y, form.1, transposed, bias, accumulate, epilogue);
             }
         }
     }
@@ -124,14 +149,14 @@ fn gemm_matches_f64() {
 #[test]
 fn gemm_options_combine() {
     // 1..=17 outputs cover every remainder of the micro-kernel.
-    for isa in Isa::available() {
+    for form in forms() {
         for outputs in 1..=17 {
             let case = GemmCase::new(13, outputs, 64);
             for bits in 0..8 {
                 for epilogue in ["none", "relu", "mask", "in place"] {
                     let (transposed, bias, accumulate) = (bits & 1 > 0, bits & 2 > 0, bits & 4 > 0);
-                    let y = case.run(isa, transposed, bias, accumulate, epilogue);
-                    case.check(&y, transposed, bias, accumulate, epilogue);
+                    let y = case.run(form, transposed, bias, accumulate, epilogue);
+                    case.check(&y, form.1, transposed, bias, accumulate, epilogue);
                 }
             }
         }
@@ -144,7 +169,7 @@ fn fused_gemm_is_bitwise_equal_across_instruction_sets() {
     let results: Vec<AlignedVec> = Isa::available()
         .into_iter()
         .filter(|&isa| isa != Isa::Portable)
-        .map(|isa| case.run(isa, false, true, false, "relu"))
+        .map(|isa| case.run((isa, Products::F32), false, true, false, "relu"))
         .collect();
     for y in &results {
         assert_eq!(y[..], results[0][..]);
@@ -152,10 +177,12 @@ fn fused_gemm_is_bitwise_equal_across_instruction_sets() {
 }
 
 /// Runs `outer` twice on the same accumulator, the second time with `x` in two parts, and adds the result to ones.
-fn outer_twice(isa: Isa, k: usize, n: usize, rows: usize) -> Vec<f32> {
+fn outer_twice((isa, products): (Isa, Products), k: usize, n: usize, rows: usize) -> Vec<f32> {
     let ld = row_stride(rows);
     let (x, d) = (noise(k * ld, 5), noise(n * ld, 6));
     let mut g = AlignedVec::zeroed(outer_len(k, n) + 1);
+    let mut scratch = AlignedVec::zeroed(outer_scratch(products, k, n, rows) + 1);
+    *scratch.last_mut().unwrap() = CANARY;
     g[outer_len(k, n)] = CANARY;
     let split = if outer::x_along_vectors(k, n) { k / 2 / outer::PANEL * outer::PANEL } else { k / 2 };
     for (first, end) in [(0, k), (0, split), (split, k)] {
@@ -169,12 +196,14 @@ fn outer_twice(isa: Isa, k: usize, n: usize, rows: usize) -> Vec<f32> {
             ldd: ld,
             n,
             rows,
+            products,
+            scratch: scratch.as_mut_ptr(),
             g: g.as_mut_ptr(),
         };
         // SAFETY: `isa` is available, and the buffers have the shapes given.
         unsafe { outer(isa, args) };
     }
-    assert_eq!(g[outer_len(k, n)], CANARY, "stray write");
+    assert_eq!((g[outer_len(k, n)], scratch.last()), (CANARY, Some(&CANARY)), "stray write");
     let mut out = vec![1.0; k * n];
     unblock(&g, k, n, &mut out, true);
     out
@@ -184,21 +213,22 @@ fn outer_twice(isa: Isa, k: usize, n: usize, rows: usize) -> Vec<f32> {
 fn outer_matches_f64_and_agrees_where_multiply_adds_are_fused() {
     for (i, k) in SIZES.into_iter().enumerate() {
         for (j, n) in partners(k).enumerate() {
-            let rows = [4, 32, 96, 192, 404][(i + j) % 5];
+            let rows = [8, 32, 96, 192, 408][(i + j) % 5];
             let ld = row_stride(rows);
             let (x, d) = (noise(k * ld, 5), noise(n * ld, 6));
             let mut fused: Option<Vec<f32>> = None;
-            for isa in Isa::available() {
-                let out = outer_twice(isa, k, n, rows);
+            for (isa, products) in forms() {
+                let out = outer_twice((isa, products), k, n, rows);
                 for a in 0..k {
                     for b in 0..n {
                         let pairs = x[a * ld..].iter().zip(&d[b * ld..]).take(rows);
-                        let expected = 1.0 + 2.0 * pairs.map(|(&x, &d)| x as f64 * d as f64).sum::<f64>();
+                        let product = |(&x, &d)| rounded(products, x) * rounded(products, d);
+                        let expected = 1.0 + 2.0 * pairs.map(product).sum::<f64>();
                         let got = out[a * n + b] as f64;
                         assert!((got - expected).abs() < 5e-5, "{isa} {k}x{n}: g[{a}][{b}] = {got}, not {expected}");
                     }
                 }
-                if isa != Isa::Portable {
+                if isa != Isa::Portable && products == Products::F32 {
                     assert_eq!(*fused.get_or_insert(out.clone()), out, "{isa} {k}x{n} differs");
                 }
             }
@@ -208,10 +238,10 @@ fn outer_matches_f64_and_agrees_where_multiply_adds_are_fused() {
 
 #[test]
 fn kernels_repeat_bitwise() {
-    for isa in Isa::available() {
+    for form in forms() {
         let case = GemmCase::new(63, 34, 96);
-        assert_eq!(case.run(isa, true, true, true, "none")[..], case.run(isa, true, true, true, "none")[..]);
-        assert_eq!(outer_twice(isa, 34, 63, 96), outer_twice(isa, 34, 63, 96));
+        assert_eq!(case.run(form, true, true, true, "none")[..], case.run(form, true, true, true, "none")[..]);
+        assert_eq!(outer_twice(form, 34, 63, 96), outer_twice(form, 34, 63, 96));
     }
 }
 

@@ -15,6 +15,7 @@ pub(crate) mod math;
 pub mod outer;
 pub mod panels;
 pub mod peak;
+pub mod products;
 pub mod reduce;
 mod simd;
 mod simd_portable;
@@ -29,11 +30,12 @@ mod matrix_tests;
 mod vector_tests;
 
 pub use aligned::AlignedVec;
-pub use gemm::{Epilogue, Gemm, gemm};
+pub use gemm::{Epilogue, Gemm, gemm, gemm_scratch};
 pub use isa::Isa;
-pub use outer::{Outer, outer, outer_len, unblock};
+pub use outer::{Outer, outer, outer_len, outer_scratch, unblock};
 pub use panels::{pack_panels, panel_len};
 pub use peak::peak_gflops;
+pub use products::Products;
 pub use reduce::{rows_max, rows_sum};
 pub use vector::{Operand, Operands, apply};
 

@@ -6,15 +6,18 @@
 //!
 //! `g` lies in panels too, `[vectors / 32][others][32]`. The operand along vectors is the one that costs less
 //! ([`x_along_vectors`]); every sum over rows runs in order, with fused multiply-adds where there are any.
-use super::Isa;
+use super::products::{Channels, Multiply, Pairs, Singles, over_rows_len};
 use super::simd::{Kernel, Simd, launch};
+use super::{Isa, Products};
 use std::mem::MaybeUninit;
 
 /// Channels of a panel.
 pub const PANEL: usize = 32;
 /// Row counts are multiples of this.
-pub const ROWS: usize = 4;
-/// Most rows of a transposed panel: 24 KiB, which stay in the L1 cache while the other operand passes by.
+pub const ROWS: usize = 8;
+/// Lanes along the sum that are transposed, and multiplied, at a time: half of `ROWS`, which are in pairs at most.
+const STEPS: usize = 4;
+/// Most rows (or pairs) of a transposed panel: 24 KiB, which stay in the L1 cache while the other operand passes by.
 const PANEL_ROWS: usize = 192;
 /// Transposing a value takes about as long as this many multiply-adds.
 const TRANSPOSITION: usize = 6;
@@ -22,6 +25,10 @@ const TRANSPOSITION: usize = 6;
 /// Operands of [`outer`].
 #[derive(Clone, Copy, Debug)]
 pub struct Outer {
+    /// What is multiplied.
+    pub products: Products,
+    /// [`outer_scratch`] lanes, which the kernel may write.
+    pub scratch: *mut f32,
     /// `[k][rows]`, row stride `ldx`: the channels from `first` on of an operand that has `channels` of them.
     pub x: *const f32,
     pub ldx: usize,
@@ -33,7 +40,7 @@ pub struct Outer {
     pub d: *const f32,
     pub ldd: usize,
     pub n: usize,
-    /// A multiple of [`ROWS`]; all of them count.
+    /// A multiple of [`ROWS`]; all of them count. Both operands have whole blocks of [`super::ROW_BLOCK`] rows.
     pub rows: usize,
     /// Accumulator of [`outer_len`]`(channels, n)` floats, in panels.
     pub g: *mut f32,
@@ -48,6 +55,13 @@ pub fn x_along_vectors(k: usize, n: usize) -> bool {
 /// Floats of a `k` by `n` accumulator in panels.
 pub fn outer_len(k: usize, n: usize) -> usize {
     if x_along_vectors(k, n) { k.next_multiple_of(PANEL) * n } else { k * n.next_multiple_of(PANEL) }
+}
+
+/// Lanes of scratch that the sum over `rows` rows of operands of `k` and `n` channels takes: both in pairs.
+pub fn outer_scratch(products: Products, k: usize, n: usize, rows: usize) -> usize {
+    let (vectors, others) = if x_along_vectors(k, n) { (k, n) } else { (n, k) };
+    let rows = rows.min(PANEL_ROWS * products.values());
+    over_rows_len(products, others, rows) + over_rows_len(products, vectors.min(PANEL), rows)
 }
 
 /// Adds the outer products of all rows to `g`. What the padding of its last panel holds afterwards means nothing.
@@ -84,41 +98,47 @@ pub fn unblock(g: &[f32], k: usize, n: usize, out: &mut [f32], add: bool) {
     }
 }
 
-/// Some channels of a tile, `ld` floats apart.
-#[derive(Clone, Copy)]
-struct Channels {
-    at: *const f32,
-    ld: usize,
-    count: usize,
-}
-
 /// A transposed panel, `[row][PANEL]`.
 #[repr(align(64))]
 struct Panel(MaybeUninit<[f32; PANEL_ROWS * PANEL]>);
 
 impl Kernel for Outer {
     type Out = ();
+    const PAIRS: bool = true;
 
     #[inline(always)]
     unsafe fn run<S: Simd>(&self) {
-        // SAFETY: forwarded contract. `NV * LANES` divides `PANEL`.
+        // SAFETY: forwarded contract.
         unsafe {
-            match S::REGISTERS {
-                32.. => self.panels::<S, 8, 2, 1>(),
-                16.. => self.panels::<S, 3, 4, 2>(),
-                _ => self.panels::<S, 2, 2, 1>(),
+            match self.products {
+                Products::F32 => self.run_with::<S, Singles>(),
+                Products::Bf16 => self.run_with::<S, Pairs>(),
             }
         }
     }
 }
 
 impl Outer {
+    /// # Safety
+    /// As [`outer`].
+    #[inline(always)]
+    unsafe fn run_with<S: Simd, P: Multiply<S>>(&self) {
+        // SAFETY: forwarded contract. `NV * LANES` divides `PANEL`.
+        unsafe {
+            match S::REGISTERS {
+                32.. => self.panels::<S, P, 8, 2, 1>(),
+                16.. => self.panels::<S, P, 3, 4, 2>(),
+                _ => self.panels::<S, P, 2, 2, 1>(),
+            }
+        }
+    }
+
     /// All panels, in blocks of `MR` channels and `NV` vectors, or `HALF` as many at the end of the last panel.
     ///
     /// # Safety
     /// As [`outer`], and `NV * S::LANES` divides [`PANEL`].
     #[inline(always)]
-    unsafe fn panels<S: Simd, const MR: usize, const NV: usize, const HALF: usize>(&self) {
+    unsafe fn panels<S: Simd, P: Multiply<S>, const MR: usize, const NV: usize, const HALF: usize>(&self) {
         let x = Channels { at: self.x, ld: self.ldx, count: self.k };
         let d = Channels { at: self.d, ld: self.ldd, count: self.n };
         let (vectors, others, height, first) = if x_along_vectors(self.channels, self.n) {
@@ -130,7 +150,14 @@ impl Outer {
         let panel: *mut f32 = panel.0.as_mut_ptr().cast();
         let mut row = 0;
         while row < self.rows {
-            let rows = PANEL_ROWS.min(self.rows - row);
+            let rows = (PANEL_ROWS * P::PRODUCTS.values()).min(self.rows - row);
+            let steps = P::PRODUCTS.lanes(rows);
+            // SAFETY: `rows` rows from `row` on of every channel, in whole blocks, and the scratch has room for them.
+            let (others, strip) = unsafe {
+                let others = Channels { at: others.at.add(row), ..others };
+                let strip = self.scratch.wrapping_add(over_rows_len(P::PRODUCTS, others.count, rows));
+                (P::over_rows(others, rows, self.scratch), strip)
+            };
             let mut channel = 0;
             while channel < vectors.count {
                 let count = PANEL.min(vectors.count - channel);
@@ -138,16 +165,15 @@ impl Outer {
                 // the panel has room for them. Panel `channel / PANEL` of `g` has `height` lines of `PANEL` floats.
                 unsafe {
                     let from = Channels { at: vectors.at.add(channel * vectors.ld + row), count, ..vectors };
-                    transpose::<S>(from, rows, panel);
-                    let others = Channels { at: others.at.add(row), ..others };
+                    transpose::<S>(P::over_rows(from, rows, strip), steps, panel);
                     let g = self.g.add(first + channel * height);
                     let mut column = 0;
                     while column < count {
                         let (panel, g) = (panel.add(column), g.add(column));
                         if count - column > HALF * S::LANES {
-                            blocks::<S, MR, NV>(panel, others, rows, g);
+                            blocks::<S, P, MR, NV>(panel, others, steps, g);
                         } else {
-                            blocks::<S, MR, HALF>(panel, others, rows, g);
+                            blocks::<S, P, MR, HALF>(panel, others, steps, g);
                         }
                         column += NV * S::LANES;
                     }
@@ -159,7 +185,7 @@ impl Outer {
     }
 }
 
-/// Writes `rows` rows of up to [`PANEL`] channels to `panel`, in whole vectors; channels beyond the last one repeat it.
+/// Writes `rows` lanes of up to [`PANEL`] channels to `panel`, in whole vectors; channels beyond the last one repeat it.
 ///
 /// # Safety
 /// As [`outer`]: the channels have `rows` rows, and `panel` has room for as many lines of [`PANEL`] floats.
@@ -175,7 +201,7 @@ unsafe fn transpose<S: Simd>(from: Channels, rows: usize, panel: *mut f32) {
         while row < rows {
             // SAFETY: four rows of existing channels, and four lines of the panel; `LANES` divides `PANEL`.
             unsafe { S::transpose_rows(&at, row, panel.add(row * PANEL + channel), PANEL) };
-            row += ROWS;
+            row += STEPS;
         }
         channel += S::LANES;
     }
@@ -186,10 +212,10 @@ unsafe fn transpose<S: Simd>(from: Channels, rows: usize, panel: *mut f32) {
 /// # Safety
 /// As [`Outer::panels`]: `panel` and `g` point to the first of `NV` vectors, `g` has a line for each of `others`.
 #[inline(always)]
-unsafe fn blocks<S: Simd, const MR: usize, const NV: usize>(
+unsafe fn blocks<S: Simd, P: Multiply<S>, const MR: usize, const NV: usize>(
     panel: *const f32,
     others: Channels,
-    rows: usize,
+    steps: usize,
     g: *mut f32,
 ) {
     let mut channel = 0;
@@ -200,15 +226,15 @@ unsafe fn blocks<S: Simd, const MR: usize, const NV: usize>(
         unsafe {
             let (from, g) = (Channels { at: others.at.add(channel * others.ld), ..others }, g.add(channel * PANEL));
             match count {
-                1 => block::<S, 1, NV>(panel, from, rows, g),
-                2 => block::<S, 2, NV>(panel, from, rows, g),
-                3 => block::<S, 3, NV>(panel, from, rows, g),
+                1 => block::<S, P, 1, NV>(panel, from, steps, g),
+                2 => block::<S, P, 2, NV>(panel, from, steps, g),
+                3 => block::<S, P, 3, NV>(panel, from, steps, g),
                 // Guarded, so that narrow kernels do not compile blocks that they never need.
-                4 if MR > 4 => block::<S, 4, NV>(panel, from, rows, g),
-                5 if MR > 4 => block::<S, 5, NV>(panel, from, rows, g),
-                6 if MR > 4 => block::<S, 6, NV>(panel, from, rows, g),
-                7 if MR > 4 => block::<S, 7, NV>(panel, from, rows, g),
-                _ => block::<S, MR, NV>(panel, from, rows, g),
+                4 if MR > 4 => block::<S, P, 4, NV>(panel, from, steps, g),
+                5 if MR > 4 => block::<S, P, 5, NV>(panel, from, steps, g),
+                6 if MR > 4 => block::<S, P, 6, NV>(panel, from, steps, g),
+                7 if MR > 4 => block::<S, P, 7, NV>(panel, from, steps, g),
+                _ => block::<S, P, MR, NV>(panel, from, steps, g),
             }
         }
         channel += count;
@@ -220,13 +246,13 @@ unsafe fn blocks<S: Simd, const MR: usize, const NV: usize>(
 /// # Safety
 /// As [`blocks`], and `others` has `MR` channels left.
 #[inline(always)]
-unsafe fn block<S: Simd, const MR: usize, const NV: usize>(
+unsafe fn block<S: Simd, P: Multiply<S>, const MR: usize, const NV: usize>(
     panel: *const f32,
     others: Channels,
-    rows: usize,
+    steps: usize,
     g: *mut f32,
 ) {
-    // SAFETY: rows stay below `rows`, a multiple of `ROWS`; vectors and lines are those that the caller vouches for.
+    // SAFETY: steps stay below `steps`, a multiple of `STEPS`; vectors and lines are those that the caller vouches for.
     unsafe {
         for i in 0..MR {
             for j in 0..NV {
@@ -239,9 +265,9 @@ unsafe fn block<S: Simd, const MR: usize, const NV: usize>(
         for i in 0..MR {
             xs[i] = others.at.add(i * others.ld);
         }
-        let mut row = 0;
-        while row < rows {
-            for r in row..row + ROWS {
+        let mut step = 0;
+        while step < steps {
+            for r in step..step + STEPS {
                 let line = panel.add(r * PANEL);
                 if NV > MR {
                     let mut ws = [zero; MR];
@@ -251,7 +277,7 @@ unsafe fn block<S: Simd, const MR: usize, const NV: usize>(
                     for j in 0..NV {
                         let v = S::load(line.add(j * S::LANES));
                         for i in 0..MR {
-                            acc[i][j] = S::fma(ws[i], v, acc[i][j]);
+                            acc[i][j] = P::multiply_add(ws[i], v, acc[i][j]);
                         }
                     }
                 } else {
@@ -262,12 +288,12 @@ unsafe fn block<S: Simd, const MR: usize, const NV: usize>(
                     for i in 0..MR {
                         let w = S::splat(*xs[i].add(r));
                         for j in 0..NV {
-                            acc[i][j] = S::fma(w, vs[j], acc[i][j]);
+                            acc[i][j] = P::multiply_add(w, vs[j], acc[i][j]);
                         }
                     }
                 }
             }
-            row += ROWS;
+            step += STEPS;
         }
         for i in 0..MR {
             for j in 0..NV {

@@ -1,6 +1,7 @@
 //! The multiply-add peak of this machine, to which kernel speeds are compared.
-use super::Isa;
+use super::products::{Multiply, Pairs, Singles};
 use super::simd::{Kernel, Simd, launch};
+use super::{Isa, Products};
 use std::hint::black_box;
 use std::time::{Duration, Instant};
 
@@ -8,24 +9,24 @@ use std::time::{Duration, Instant};
 const STEPS: usize = 20_000;
 
 /// GFLOP/s (a multiply-add counts twice) of `threads` threads that do nothing but multiply-adds for `ms` milliseconds,
-/// with the best instruction set.
-pub fn peak_gflops(threads: usize, ms: f64) -> f64 {
+/// of `products`, with the best instruction set.
+pub fn peak_gflops(products: Products, threads: usize, ms: f64) -> f64 {
     let isa = Isa::detect();
     let limit = Duration::from_secs_f64(ms * 1e-3);
     std::thread::scope(|scope| {
-        let others: Vec<_> = (1..threads).map(|_| scope.spawn(move || rate(isa, limit))).collect();
-        let own = rate(isa, limit);
+        let others: Vec<_> = (1..threads).map(|_| scope.spawn(move || rate(isa, products, limit))).collect();
+        let own = rate(isa, products, limit);
         own + others.into_iter().map(|t| t.join().expect("a measuring thread panicked")).sum::<f64>()
     })
 }
 
 /// GFLOP/s of the calling thread.
-fn rate(isa: Isa, limit: Duration) -> f64 {
+fn rate(isa: Isa, products: Products, limit: Duration) -> f64 {
     let start = Instant::now();
     let mut flops = 0.0;
     loop {
         // SAFETY: `isa` was detected, and the kernel touches no memory.
-        flops += unsafe { launch(isa, &Chains) };
+        flops += unsafe { launch(isa, &Chains(products)) };
         let elapsed = start.elapsed();
         if elapsed >= limit {
             return flops / elapsed.as_secs_f64() * 1e-9;
@@ -35,19 +36,19 @@ fn rate(isa: Isa, limit: Duration) -> f64 {
 
 /// Runs [`STEPS`] multiply-adds in every chain and returns the number of operations. There are more independent chains
 /// than latency times throughput of current cores, while chains and factors stay within the registers.
-struct Chains;
+struct Chains(Products);
 
 impl Kernel for Chains {
     type Out = f64;
+    const PAIRS: bool = true;
 
     #[inline(always)]
     unsafe fn run<S: Simd>(&self) -> f64 {
         // SAFETY: forwarded contract.
         unsafe {
-            match S::REGISTERS {
-                32.. => chains::<S, 20>(),
-                16.. => chains::<S, 12>(),
-                _ => chains::<S, 6>(),
+            match self.0 {
+                Products::F32 => chains_of::<S, Singles>(),
+                Products::Bf16 => chains_of::<S, Pairs>(),
             }
         }
     }
@@ -56,14 +57,29 @@ impl Kernel for Chains {
 /// # Safety
 /// The CPU has the instruction set of `S`.
 #[inline(always)]
-unsafe fn chains<S: Simd, const N: usize>() -> f64 {
+unsafe fn chains_of<S: Simd, P: Multiply<S>>() -> f64 {
+    // SAFETY: forwarded contract.
+    unsafe {
+        match S::REGISTERS {
+            32.. => chains::<S, P, 20>(),
+            16.. => chains::<S, P, 12>(),
+            _ => chains::<S, P, 6>(),
+        }
+    }
+}
+
+/// # Safety
+/// The CPU has the instruction set of `S`.
+#[inline(always)]
+unsafe fn chains<S: Simd, P: Multiply<S>, const N: usize>() -> f64 {
     // SAFETY: register operations of an instruction set that the caller vouches for.
     unsafe {
-        let (a, b) = (S::splat(black_box(0.5)), S::splat(black_box(1.0)));
+        // Chains stay at 1, as floats and as pairs.
+        let (a, b) = (S::splat(black_box(0.0)), S::splat(black_box(1.0)));
         let mut acc = [S::splat(black_box(0.0)); N];
         for _ in 0..STEPS {
             for v in &mut acc {
-                *v = S::fma(*v, a, b);
+                *v = P::multiply_add(*v, a, b);
             }
         }
         let mut sum = acc[0];
@@ -74,13 +90,17 @@ unsafe fn chains<S: Simd, const N: usize>() -> f64 {
         S::store(out.as_mut_ptr(), sum);
         black_box(out);
     }
-    (STEPS * N * S::LANES * 2) as f64
+    (STEPS * N * S::LANES * 2 * P::PRODUCTS.values()) as f64
 }
 
 #[cfg(test)]
 mod tests {
+    use super::*;
+
     #[test]
     fn peak_is_positive() {
-        assert!(super::peak_gflops(2, 2.0) > 0.1);
+        for products in [Products::F32, Products::Bf16] {
+            assert!(peak_gflops(products, 2, 2.0) > 0.1);
+        }
     }
 }

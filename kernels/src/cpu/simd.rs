@@ -60,6 +60,9 @@ pub(super) trait Simd {
     unsafe fn ueq(a: Self::V, b: Self::V) -> Self::M;
     unsafe fn select(m: Self::M, a: Self::V, b: Self::V) -> Self::V;
 
+    /// The even and the odd ones of `2 * LANES` floats.
+    unsafe fn load_even_odd(p: *const f32) -> (Self::V, Self::V);
+
     /// Stores four vectors, `stride` floats apart: vector `r` holds `*from[i].add(row + r)` in lane `i`.
     unsafe fn transpose_rows(from: &[*const f32; 16], row: usize, to: *mut f32, stride: usize);
 
@@ -67,6 +70,30 @@ pub(super) trait Simd {
     unsafe fn splat(x: f32) -> Self::V {
         // SAFETY: forwarded contract.
         unsafe { Self::splat_bits(x.to_bits()) }
+    }
+
+    /// Lanes of two bfloat16 values, `first` in the low half: each rounded to nearest, ties to even.
+    #[inline(always)]
+    unsafe fn pair(first: Self::V, second: Self::V) -> Self::V {
+        // SAFETY: forwarded contract.
+        unsafe { pair_of_rounded::<Self>(first, second) }
+    }
+
+    /// `2 * LANES` floats in pairs, as [`Simd::pair`].
+    #[inline(always)]
+    unsafe fn load_pairs(p: *const f32) -> Self::V {
+        // SAFETY: forwarded contract.
+        unsafe {
+            let (even, odd) = Self::load_even_odd(p);
+            Self::pair(even, odd)
+        }
+    }
+
+    /// `c` plus both products of the pairs in `a` and `b`.
+    #[inline(always)]
+    unsafe fn dot(a: Self::V, b: Self::V, c: Self::V) -> Self::V {
+        // SAFETY: forwarded contract.
+        unsafe { dot_of_halves::<Self>(a, b, c) }
     }
 
     /// `p * 2^n` for integral `n` in -160..=160 and `p` near 1, rounded once.
@@ -85,6 +112,38 @@ pub(super) trait Simd {
 /// Adding 1.5 * 2^23 rounds a float of magnitude below 2^22 to an integer, which the low mantissa bits then hold.
 pub(super) const ROUND_MAGIC: f32 = 12_582_912.0;
 
+/// [`Simd::pair`] where no instruction rounds.
+#[inline(always)]
+pub(super) unsafe fn pair_of_rounded<S: Simd + ?Sized>(first: S::V, second: S::V) -> S::V {
+    // SAFETY: forwarded contract of `Simd`.
+    unsafe {
+        let low = S::shr(round_bf16::<S>(first), S::splat_bits(16));
+        S::or(low, S::and(round_bf16::<S>(second), S::splat_bits(0xffff_0000)))
+    }
+}
+
+/// [`Simd::dot`] where no instruction multiplies pairs: a bfloat16 value is the upper half of the same float.
+#[inline(always)]
+pub(super) unsafe fn dot_of_halves<S: Simd + ?Sized>(a: S::V, b: S::V, c: S::V) -> S::V {
+    // SAFETY: forwarded contract of `Simd`.
+    unsafe {
+        let (low, high) = (S::splat_bits(16), S::splat_bits(0xffff_0000));
+        let c = S::fma(S::and(a, high), S::and(b, high), c);
+        S::fma(S::shl(a, low), S::shl(b, low), c)
+    }
+}
+
+/// Bits whose upper half is `a` rounded to bfloat16. A NaN stays one.
+#[inline(always)]
+unsafe fn round_bf16<S: Simd + ?Sized>(a: S::V) -> S::V {
+    // SAFETY: forwarded contract of `Simd`.
+    unsafe {
+        let even = S::and(S::shr(a, S::splat_bits(16)), S::splat_bits(1));
+        let rounded = S::uadd(S::uadd(a, S::splat_bits(0x7fff)), even);
+        S::select(S::eq(a, a), rounded, S::or(a, S::splat_bits(0x40_0000)))
+    }
+}
+
 /// `2^n` for integral `n` in -126..=127.
 #[inline(always)]
 unsafe fn pow2<S: Simd + ?Sized>(n: S::V) -> S::V {
@@ -98,6 +157,8 @@ unsafe fn pow2<S: Simd + ?Sized>(n: S::V) -> S::V {
 /// A computation that is generic over the vector type.
 pub(super) trait Kernel {
     type Out;
+    /// Whether it multiplies pairs ([`Simd::dot`]); others are not compiled for them.
+    const PAIRS: bool = false;
 
     /// Runs the kernel; implementations are `#[inline(always)]`.
     ///
@@ -116,7 +177,10 @@ pub(super) unsafe fn launch<K: Kernel>(isa: Isa, kernel: &K) -> K::Out {
     match isa {
         // SAFETY: the caller vouches for `isa` and for the kernel's contract.
         #[cfg(target_arch = "x86_64")]
-        Isa::Avx512 => unsafe { super::simd_x86::run_avx512(kernel) },
+        Isa::Avx512Bf16 if K::PAIRS => unsafe { super::simd_x86::run_avx512_bf16(kernel) },
+        // SAFETY: as above; the other instruction set has this one.
+        #[cfg(target_arch = "x86_64")]
+        Isa::Avx512Bf16 | Isa::Avx512 => unsafe { super::simd_x86::run_avx512(kernel) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
         Isa::Avx2 => unsafe { super::simd_x86::run_avx2(kernel) },

@@ -252,6 +252,19 @@ impl Simd for Portable {
     }
 
     #[inline(always)]
+    unsafe fn load_even_odd(p: *const f32) -> (Lanes, Lanes) {
+        let mut halves = (Lanes([0; LANES]), Lanes([0; LANES]));
+        for i in 0..LANES {
+            // SAFETY: the caller vouches for 16 lanes at `p`.
+            unsafe {
+                halves.0.0[i] = (*p.add(2 * i)).to_bits();
+                halves.1.0[i] = (*p.add(2 * i + 1)).to_bits();
+            }
+        }
+        halves
+    }
+
+    #[inline(always)]
     unsafe fn transpose_rows(from: &[*const f32; 16], row: usize, to: *mut f32, stride: usize) {
         for r in 0..4 {
             for i in 0..LANES {

@@ -1,5 +1,5 @@
 //! Vectors of x86-64: AVX-512 and AVX2 with FMA.
-use super::simd::{Kernel, Simd};
+use super::simd::{Kernel, Simd, dot_of_halves, pair_of_rounded};
 use std::arch::x86_64::*;
 
 /// Runs `kernel` with 512-bit vectors.
@@ -9,7 +9,17 @@ use std::arch::x86_64::*;
 #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
 pub(super) unsafe fn run_avx512<K: Kernel>(kernel: &K) -> K::Out {
     // SAFETY: forwarded contract.
-    unsafe { kernel.run::<Avx512>() }
+    unsafe { kernel.run::<Avx512<false>>() }
+}
+
+/// Runs `kernel` with 512-bit vectors and dot products of pairs.
+///
+/// # Safety
+/// As [`run_avx512`], and the CPU has AVX-512 BF16.
+#[target_feature(enable = "avx512bf16,avx512f,avx512vl,avx512dq,avx512bw,avx2,fma")]
+pub(super) unsafe fn run_avx512_bf16<K: Kernel>(kernel: &K) -> K::Out {
+    // SAFETY: forwarded contract.
+    unsafe { kernel.run::<Avx512<true>>() }
 }
 
 /// Runs `kernel` with 256-bit vectors.
@@ -55,10 +65,10 @@ macro_rules! registers {
     )*};
 }
 
-/// 16 lanes.
-pub(super) struct Avx512;
+/// 16 lanes. `BF16`: the CPU multiplies pairs of bfloat16 values.
+pub(super) struct Avx512<const BF16: bool>;
 
-impl Avx512 {
+impl<const BF16: bool> Avx512<BF16> {
     /// Mask of the first `n < 16` lanes.
     #[inline(always)]
     fn head(n: usize) -> __mmask16 {
@@ -66,7 +76,18 @@ impl Avx512 {
     }
 }
 
-impl Simd for Avx512 {
+/// Halves of 16-bit values, `[first 16 | second 16]`, in pairs.
+static INTERLEAVE: [u16; 32] = {
+    let mut index = [0; 32];
+    let mut i = 0;
+    while i < 32 {
+        index[i] = (i / 2 + i % 2 * 16) as u16;
+        i += 1;
+    }
+    index
+};
+
+impl<const BF16: bool> Simd for Avx512<BF16> {
     const LANES: usize = 16;
     const REGISTERS: usize = 32;
     type V = __m512;
@@ -148,6 +169,57 @@ impl Simd for Avx512 {
             _mm512_cmpeq_epi32_mask(_mm512_castps_si512(a), _mm512_castps_si512(b))
         }
         fn select(m: __mmask16, a: __m512, b: __m512) -> __m512 { _mm512_mask_blend_ps(m, b, a) }
+    }
+
+    #[inline(always)]
+    unsafe fn load_even_odd(p: *const f32) -> (__m512, __m512) {
+        // SAFETY: the caller vouches for 32 lanes at `p`.
+        unsafe {
+            let (a, b) = (_mm512_loadu_ps(p), _mm512_loadu_ps(p.add(16)));
+            let even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
+            let odd = _mm512_or_si512(even, _mm512_set1_epi32(1));
+            (_mm512_permutex2var_ps(a, even, b), _mm512_permutex2var_ps(a, odd, b))
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn pair(first: __m512, second: __m512) -> __m512 {
+        // SAFETY: register operations, and a constant; the caller vouches for the instruction set.
+        unsafe {
+            if BF16 {
+                let halves: __m512i = std::mem::transmute(_mm512_cvtne2ps_pbh(second, first));
+                let order = _mm512_loadu_si512(INTERLEAVE.as_ptr().cast());
+                _mm512_castsi512_ps(_mm512_permutexvar_epi16(order, halves))
+            } else {
+                pair_of_rounded::<Self>(first, second)
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn load_pairs(p: *const f32) -> __m512 {
+        // SAFETY: the caller vouches for 32 lanes at `p`, and for the instruction set.
+        unsafe {
+            if BF16 {
+                std::mem::transmute::<__m512bh, __m512>(_mm512_cvtne2ps_pbh(Self::load(p.add(16)), Self::load(p)))
+            } else {
+                let (even, odd) = Self::load_even_odd(p);
+                Self::pair(even, odd)
+            }
+        }
+    }
+
+    #[inline(always)]
+    unsafe fn dot(a: __m512, b: __m512, c: __m512) -> __m512 {
+        // SAFETY: register operations; the caller vouches for the instruction set.
+        unsafe {
+            if BF16 {
+                let [a, b] = std::mem::transmute::<[__m512; 2], [__m512bh; 2]>([a, b]);
+                _mm512_dpbf16_ps(c, a, b)
+            } else {
+                dot_of_halves::<Self>(a, b, c)
+            }
+        }
     }
 
     #[inline(always)]
@@ -280,6 +352,17 @@ impl Simd for Avx2 {
             _mm256_castsi256_ps(_mm256_cmpgt_epi32(_mm256_xor_si256(b, flip), _mm256_xor_si256(a, flip)))
         }
         fn select(m: __m256, a: __m256, b: __m256) -> __m256 { _mm256_blendv_ps(b, a, m) }
+    }
+
+    #[inline(always)]
+    unsafe fn load_even_odd(p: *const f32) -> (__m256, __m256) {
+        // SAFETY: the caller vouches for 16 lanes at `p`.
+        unsafe {
+            // In each half of a vector first those of `a`, then those of `b`: the middle quarters change places.
+            let (a, b) = (_mm256_loadu_ps(p), _mm256_loadu_ps(p.add(8)));
+            let ordered = |v| _mm256_castpd_ps(_mm256_permute4x64_pd::<0b11_01_10_00>(_mm256_castps_pd(v)));
+            (ordered(_mm256_shuffle_ps::<0b10_00_10_00>(a, b)), ordered(_mm256_shuffle_ps::<0b11_01_11_01>(a, b)))
+        }
     }
 
     #[inline(always)]

@@ -99,10 +99,6 @@ fn invertible_warps_that_do_not_fit() {
 fn a_device_that_is_not_there() {
     let w = Workplace::new();
     mentions(
-        &w.refuse(&["train", "tiny.toml", "--device", "cpu", "--precision", "mixed", "--out", "run"]),
-        &["CPU", "no half precision", "--precision f32"],
-    );
-    mentions(
         &w.refuse(&["train", "tiny.toml", "--precision", "double", "--out", "run"]),
         &["--precision", "run.precision", "`f32` or `mixed`"],
     );

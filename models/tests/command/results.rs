@@ -143,6 +143,9 @@ fn bench_prints_the_numbers_of_a_step() {
     let expected = 6.0 * 3.0 * 40.0 * f64::from(weights) / 1e9;
     assert!((bench["gflop_per_step"].as_f64().unwrap() / expected - 1.0).abs() < 1e-9, "{text}");
     assert!(bench.get("per_launch").is_none());
+    // Products of pairs on the CPU.
+    let text = w.succeed(&["bench", "tiny.toml", "--steps", "1", "--device", "cpu", "--precision", "mixed"]);
+    assert!(text.contains("bf16 products"), "{text}");
     // Launch by launch, for scripts, for people and for Perfetto.
     let text = w.succeed(&["bench", "tiny.toml", "--steps", "1", "--json", "--launches", "--trace", "trace.json"]);
     let bench: Value = serde_json::from_str(&text).unwrap();

@@ -11,7 +11,7 @@ use raygrad_compiler::ops::Reduction;
 use raygrad_compiler::plan::BufferKind;
 use raygrad_compiler::plan::region::BufferId;
 use raygrad_kernels::cpu::tile::{Chunk, Flat, Memory, TileProgram, lower, pack, run_tiles, split_flat};
-use raygrad_kernels::cpu::{AlignedVec, Isa, unblock};
+use raygrad_kernels::cpu::{AlignedVec, Isa, Products, unblock};
 use rayon::prelude::*;
 use std::cell::RefCell;
 use std::collections::HashMap;
@@ -47,14 +47,15 @@ struct Loaded {
 pub(crate) struct CpuExecutor {
     pool: Arc<rayon::ThreadPool>,
     isa: Isa,
+    products: Products,
     memory: Vec<AlignedVec>,
     inputs: HashMap<String, (usize, usize)>,
     programs: Vec<Loaded>,
 }
 
 impl CpuExecutor {
-    pub fn new(pool: Arc<rayon::ThreadPool>) -> CpuExecutor {
-        CpuExecutor { pool, isa: Isa::detect(), memory: vec![], inputs: HashMap::new(), programs: vec![] }
+    pub fn new(pool: Arc<rayon::ThreadPool>, products: Products) -> CpuExecutor {
+        CpuExecutor { pool, isa: Isa::detect(), products, memory: vec![], inputs: HashMap::new(), programs: vec![] }
     }
 
     fn allocate(&mut self, lanes: usize) -> usize {
@@ -67,9 +68,9 @@ impl CpuExecutor {
     }
 }
 
-fn lower_launch(program: &Program, index: usize) -> Launch {
+fn lower_launch(program: &Program, index: usize, products: Products) -> Launch {
     let (flats, rest) = split_flat(program, &program.launches[index].region);
-    Launch { flats, tiles: rest.map(|region| lower(program, &region)) }
+    Launch { flats, tiles: rest.map(|region| lower(program, &region, products)) }
 }
 
 impl Executor for CpuExecutor {
@@ -94,7 +95,8 @@ impl Executor for CpuExecutor {
                 },
             });
         }
-        let launches: Vec<Launch> = (0..program.launches.len()).map(|i| lower_launch(&program, i)).collect();
+        let launches: Vec<Launch> =
+            (0..program.launches.len()).map(|i| lower_launch(&program, i, self.products)).collect();
         let tiles = || launches.iter().filter_map(|l| l.tiles.as_ref());
         let packed = tiles().map(|t| t.packed).max().unwrap_or(0);
         let accumulators = tiles().map(|t| t.accumulated * t.chunks).max().unwrap_or(0);

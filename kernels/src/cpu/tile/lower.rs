@@ -6,14 +6,14 @@ use super::fold::fold;
 use super::temporaries::lane_program;
 use super::values::{Values, is_alias};
 use super::*;
-use crate::cpu::{ROW_BLOCK, outer, outer_len, panel_len, row_stride};
+use crate::cpu::{ROW_BLOCK, gemm_scratch, outer, outer_len, outer_scratch, panel_len, row_stride};
 use raygrad_compiler::graph::{Axes, Axis};
 use raygrad_compiler::plan::Program;
 use raygrad_compiler::plan::region::{Inst, InstId, Region, RegionOp, Store};
 use raygrad_compiler::scalar::{ScalarProgram, Val};
 
-/// Lowers one region of `program`.
-pub fn lower(program: &Program, unfolded: &Region) -> TileProgram {
+/// Lowers one region of `program`, with matrix products of `products`.
+pub fn lower(program: &Program, unfolded: &Region, products: Products) -> TileProgram {
     let layers = unfolded.body.iter().any(|i| matches!(i.op, RegionOp::Linear(_)))
         || unfolded.stores.iter().any(|s| matches!(s, Store::Outer { .. }));
     let most = if layers { LAYER_ROWS } else { PLAIN_ROWS };
@@ -32,7 +32,7 @@ pub fn lower(program: &Program, unfolded: &Region) -> TileProgram {
         lines,
         inner: unfolded.inner.as_ref(),
         values: Values::new(region, ld),
-        out: empty(inner, line, rows, ld),
+        out: empty(products, inner, line, rows, ld),
     };
     lowering.out.outer = lowering.outer.iter().map(|a| a.size()).collect();
     // A buffer that is updated in place is read before anything is written. Constants are written once for all tiles:
@@ -69,7 +69,7 @@ fn tile_rows(inner: usize, line: usize, whole: bool, most: usize) -> usize {
     inner.div_ceil(segments).next_multiple_of(ROW_BLOCK)
 }
 
-fn empty(inner: usize, line: usize, rows: usize, ld: usize) -> TileProgram {
+fn empty(products: Products, inner: usize, line: usize, rows: usize, ld: usize) -> TileProgram {
     TileProgram {
         outer: vec![],
         inner,
@@ -78,6 +78,8 @@ fn empty(inner: usize, line: usize, rows: usize, ld: usize) -> TileProgram {
         ld,
         scratch: 0,
         temps: 0,
+        products,
+        pairs: 0,
         constants: vec![],
         ops: vec![],
         packs: vec![],
@@ -352,7 +354,14 @@ impl Lowering<'_> {
         // One more block serves kernels that need a row of their own.
         let temps = temps.max().unwrap_or(0) * BLOCK + self.out.ld.max(BLOCK);
         self.out.temps = self.values.arena_len();
-        self.out.scratch = self.out.temps + temps;
+        self.out.pairs = (self.out.temps + temps).next_multiple_of(16);
+        let products = self.out.products;
+        let pairs = self.out.ops.iter().map(|op| match op {
+            TileOp::Layer(layer) => gemm_scratch(products, layer.contraction),
+            TileOp::Store(TileStore::Outer { k, n, .. }) => outer_scratch(products, *k, *n, self.out.rows),
+            _ => 0,
+        });
+        self.out.scratch = self.out.pairs + pairs.max().unwrap_or(0);
         let per_line = |op: &TileOp| match op {
             TileOp::Store(TileStore::Reduce { view, .. }) => {
                 view.inner == 0 && view.outer.iter().chain(view.lines.iter().map(|(_, s)| s)).all(|s| *s > 0)

@@ -17,6 +17,7 @@ pub use flat::{Flat, FlatArg, split_flat};
 pub use lower::lower;
 pub use run::{Chunk, Memory, pack, run_tiles};
 
+use crate::cpu::Products;
 use raygrad_compiler::ops::Reduction;
 use raygrad_compiler::plan::region::{BufferId, Weights};
 use raygrad_compiler::scalar::Prim;
@@ -284,6 +285,8 @@ pub struct Accumulator {
 #[derive(Clone, Debug)]
 pub struct Pack {
     pub weights: Weights,
+    /// What multiplies them.
+    pub products: Products,
     pub view: View,
     /// Where the panels of the first element start, and how far apart elements are.
     pub at: usize,
@@ -308,6 +311,9 @@ pub struct TileProgram {
     pub scratch: usize,
     /// Where the temporaries of pointwise programs start.
     pub temps: usize,
+    /// What matrix products of full values multiply, and where their scratch starts.
+    pub products: Products,
+    pub pairs: usize,
     pub constants: Vec<(Place, u32)>,
     pub ops: Vec<TileOp>,
     pub packs: Vec<Pack>,

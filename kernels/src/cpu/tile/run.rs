@@ -44,11 +44,11 @@ pub unsafe fn pack(pack: &Pack, memory: Memory, packed: &mut [f32]) {
         if pack.elements == 1 {
             // SAFETY: the buffer holds the weights' channels one after the other, being of one element.
             let matrix = unsafe { std::slice::from_raw_parts(base, lanes) };
-            pack_panels(matrix, w.rows, w.columns, w.transposed, panels);
+            pack_panels(pack.products, matrix, w.rows, w.columns, w.transposed, panels);
         } else {
             // SAFETY: channel c of element e lies at c * elements + e.
             let matrix: Vec<f32> = (0..lanes).map(|c| unsafe { *base.add(c * pack.elements + e) }).collect();
-            pack_panels(&matrix, w.rows, w.columns, w.transposed, panels);
+            pack_panels(pack.products, &matrix, w.rows, w.columns, w.transposed, panels);
         }
     }
 }
@@ -300,6 +300,8 @@ impl Tile<'_> {
             x: self.at(x),
             ldx: ld,
             contraction,
+            products: pack.products,
+            scratch: self.at(self.program.pairs as Place),
             panels,
             outputs,
             bias: bias.map_or(std::ptr::null(), |b| self.at(b).cast_const()),

@@ -84,7 +84,7 @@ struct Choice {
     /// Threads of the CPU backend. Results do not depend on them.
     #[arg(long, value_name = "N")]
     threads: Option<String>,
-    /// `f32`, or `mixed`: matrix products of halves, on GPUs that have them.
+    /// `f32`, or `mixed`: matrix products of halves, f16 on GPUs that have it and bf16 on the CPU.
     #[arg(long, value_name = "PRECISION")]
     precision: Option<String>,
     /// On GPUs, first try which tiles run a step fastest. What is found is kept, so that later runs begin at once.

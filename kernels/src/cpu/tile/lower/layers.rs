@@ -131,7 +131,7 @@ impl Lowering<'_> {
             let last = parts.len() - 1;
             for (i, (x, first, n)) in parts.into_iter().enumerate() {
                 let rows = Weights { first: weights.first + first * weights.columns, rows: n, ..weights };
-                let pack = self.pack(rows, n, outputs);
+                let pack = self.pack(rows, n, outputs, full);
                 let epilogue = if i == last { epilogue } else { LayerEpilogue::None };
                 let bias = if i == 0 { bias } else { None };
                 let op = Layer { x, contraction: n, pack, bias, accumulate: i > 0, epilogue, out, outputs, full };
@@ -141,20 +141,22 @@ impl Lowering<'_> {
         }
         let (x, copy) = self.side_by_side(inst.inputs[0], full);
         let out = self.values.create(id, outputs, full);
-        let pack = self.pack(weights, contraction, outputs);
+        let pack = self.pack(weights, contraction, outputs, full);
         let op = Layer { x, contraction, pack, bias, accumulate: false, epilogue, out, outputs, full };
         self.out.ops.push(TileOp::Layer(op));
         copy.into_iter().for_each(|c| self.values.release_temporary(c));
     }
 
-    fn pack(&mut self, weights: Weights, contraction: usize, outputs: usize) -> usize {
-        if let Some(known) = self.out.packs.iter().position(|p| p.weights == weights) {
+    /// Weights of a layer on full values, or on uniform ones, which are few enough to be multiplied in single precision.
+    fn pack(&mut self, weights: Weights, contraction: usize, outputs: usize, full: bool) -> usize {
+        let products = if full { self.out.products } else { Products::F32 };
+        if let Some(known) = self.out.packs.iter().position(|p| p.weights == weights && p.products == products) {
             return known;
         }
         let view = self.view(weights.buffer);
-        let len = panel_len(contraction, outputs).next_multiple_of(16);
+        let len = panel_len(products.lanes(contraction), outputs).next_multiple_of(16);
         let elements = view.elements;
-        self.out.packs.push(Pack { weights, view, at: self.out.packed, len, elements });
+        self.out.packs.push(Pack { weights, products, view, at: self.out.packed, len, elements });
         self.out.packed += len * elements;
         self.out.packs.len() - 1
     }

@@ -115,6 +115,8 @@ impl Tile<'_> {
                             n: *n,
                             rows,
                             g,
+                            products: self.program.products,
+                            scratch: self.at(self.program.pairs as Place),
                         };
                         outer(self.isa, args);
                     }
