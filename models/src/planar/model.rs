@@ -15,6 +15,7 @@ use crate::training::optimise::{self, PROGRESS, STEP};
 use crate::warps::{self, Points, Registration, Warp};
 use raygrad_compiler::functions::loss::mean_squared_error;
 use raygrad_compiler::functions::mlp::Parameter;
+use raygrad_compiler::fuse::TargetKind;
 use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::ops::random;
 use raygrad_compiler::scalar::DType;
@@ -45,6 +46,7 @@ pub struct PlanarModel {
     frame: Axis,
     pixel: Axis,
     code: Option<Parameter>,
+    scales_loss: bool,
 }
 
 impl PlanarModel {
@@ -53,7 +55,14 @@ impl PlanarModel {
         let pixel = Axis::new("pixel", grid.crop_pixels());
         let code = warps::codes(&*warp, &frame);
         let field = NeuralImage::new(&settings.field);
-        PlanarModel { settings: settings.clone(), grid, warp, field, frame, pixel, code }
+        let scales_loss = optimise::scales_loss(settings.run.precision, TargetKind::Gpu);
+        PlanarModel { settings: settings.clone(), grid, warp, field, frame, pixel, code, scales_loss }
+    }
+
+    /// The model whose steps run on devices of this kind.
+    pub fn for_target(mut self, target: TargetKind) -> PlanarModel {
+        self.scales_loss = optimise::scales_loss(self.settings.run.precision, target);
+        self
     }
 
     /// Everything that a checkpoint holds; not all of it need be trained.
@@ -174,7 +183,7 @@ impl PlanarModel {
     #[track_caller]
     fn updates(&self, total: &Tensor) -> Vec<(Tensor, Tensor)> {
         let warp: Vec<Parameter> = self.warp_parameters().collect();
-        let mut updates = optimise::updates(total, &self.field.parameters(), &warp, self.settings.run.precision);
+        let mut updates = optimise::updates(total, &self.field.parameters(), &warp, self.scales_loss);
         let held = self.settings.warp.fix_first && self.warp.zero_code_is_identity();
         if let Some(code) = self.code.as_ref().filter(|_| held) {
             optimise::hold_first(&mut updates, &code.tensor, &self.frame);

@@ -46,7 +46,7 @@ pub struct Evaluation {
 impl Trainer {
     /// Compiles the programs and fills their inputs.
     pub fn new(settings: &Settings, data: PlanarData, warp: Arc<dyn Warp>, device: Device) -> Result<Trainer, Error> {
-        let model = PlanarModel::new(settings, data.grid, warp);
+        let model = PlanarModel::new(settings, data.grid, warp).for_target(device.target().kind);
         let (mut learner, train) = Learner::new(device, settings, &model.train_step())?;
         let (frame_view, full_view) = (View::within(data.grid, FRAME_SIDE), View::full(data.grid));
         let evaluate = learner.add(&model.evaluation())?;

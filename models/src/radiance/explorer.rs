@@ -69,6 +69,7 @@ impl Explorer {
         let settings = &data.with_depths(settings);
         let views = data.scene.train.len();
         let model = RadianceModel::new(settings, data.size, views, warp).map_err(SpaceDataError::from)?;
+        let model = model.for_target(device.target().kind);
         let view_pixels = VIEW_PIXELS.min(data.size.pixels());
         let (mut learner, train) = Learner::new(device, settings, &model.train_step())?;
         let view = learner.add(&model.view(view_pixels))?;

@@ -16,13 +16,14 @@ use super::rays::{Cameras, ImageSize, Rays, range_of};
 use super::rendering::{Purpose, Rendering, Seen};
 use crate::config::{DepthSettings, RadianceSettings, SceneSettings, Settings, TrainSettings};
 use crate::scene::View;
-use crate::training::optimise::{STEP, hold_first, update_of, updates};
+use crate::training::optimise::{STEP, hold_first, scales_loss, update_of, updates};
 use crate::warps::{self, Registration, Warp};
 use raygrad_compiler::functions::adam::StepScalars;
 use raygrad_compiler::functions::lie::se3_exp;
 use raygrad_compiler::functions::loss::mean_squared_error;
 use raygrad_compiler::functions::matrix::compose_poses;
 use raygrad_compiler::functions::mlp::Parameter;
+use raygrad_compiler::fuse::TargetKind;
 use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::ops::pick::concat;
 use raygrad_compiler::ops::random;
@@ -68,6 +69,7 @@ pub struct RadianceModel {
     frame: Axis,
     pixel: Axis,
     code: Option<Parameter>,
+    scales_loss: bool,
 }
 
 /// A 3D experiment without its sections.
@@ -96,8 +98,15 @@ impl RadianceModel {
         let pixel = Axis::new("pixel", size.pixels());
         let code = warps::codes(&*warp, &frame);
         let rendering = Rendering::new(settings)?;
+        let scales_loss = scales_loss(settings.run.precision, TargetKind::Gpu);
         let (settings, train) = (settings.clone(), train.clone());
-        Ok(RadianceModel { settings, size, train, warp, rendering, frame, pixel, code })
+        Ok(RadianceModel { settings, size, train, warp, rendering, frame, pixel, code, scales_loss })
+    }
+
+    /// The model whose steps run on devices of this kind.
+    pub fn for_target(mut self, target: TargetKind) -> RadianceModel {
+        self.scales_loss = scales_loss(self.settings.run.precision, target);
+        self
     }
 
     /// The axis of the training views.
@@ -177,8 +186,7 @@ impl RadianceModel {
         outputs.extend(found.residual.map(|r| ("alignment", r)));
         outputs.extend(found.penalty.map(|(p, _)| ("penalty", p)));
         let outputs = outputs.into_iter().map(|(name, t)| (name.to_string(), t)).collect();
-        let precision = self.settings.run.precision;
-        let mut updates = updates(&total, &self.rendering.parameters(), &self.warp_parameters(), precision);
+        let mut updates = updates(&total, &self.rendering.parameters(), &self.warp_parameters(), self.scales_loss);
         if let (true, Some(code)) = (pinned && self.warp.zero_code_is_identity(), &self.code) {
             hold_first(&mut updates, &code.tensor, &self.frame);
         }
@@ -206,7 +214,7 @@ impl RadianceModel {
         let render = self.photo_error(&compose_poses(&view_pose(), &se3_exp(&twist)));
         let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
         let scalars = StepScalars { lr: scalar(TWIST_LR), bias1: scalar(TWIST_BIAS1), bias2: scalar(TWIST_BIAS2) };
-        let updates = update_of(&render, &twist, &scalars, self.settings.run.precision);
+        let updates = update_of(&render, &twist, &scalars, self.scales_loss);
         Step { outputs: vec![("render".to_string(), render)], updates }
     }
 

@@ -85,7 +85,6 @@ impl LossScale {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Precision;
     use crate::training::optimise::{Rates, updates};
     use raygrad_compiler::functions::mlp::{Init, Parameter};
     use raygrad_compiler::{Step, compile};
@@ -99,7 +98,7 @@ mod tests {
         let factor = Tensor::data("factor", Shape::new(&[], LANES));
         let loss = (&p * factor).sum_channels();
         let parameter = Parameter { tensor: p, init: Init::Zero, trained: true };
-        let updates = updates(&loss, &[parameter], &[], Precision::Mixed);
+        let updates = updates(&loss, &[parameter], &[], true);
         let device = Device::cpu(Some(1)).unwrap();
         let mut session = Session::new(device.clone()).unwrap();
         let program = compile(&Step { outputs: vec![], updates }, &device.target()).unwrap();

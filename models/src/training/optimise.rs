@@ -10,6 +10,7 @@ use crate::config::{Optim, Precision};
 use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::functions::adam::{Adam, Moments, StepScalars};
 use raygrad_compiler::functions::mlp::Parameter;
+use raygrad_compiler::fuse::TargetKind;
 use raygrad_compiler::{Axis, Shape, Tensor};
 
 pub const STEP: &str = "step";
@@ -59,16 +60,18 @@ impl Rates {
 /// Inputs with what they become.
 type Updates = Vec<(Tensor, Tensor)>;
 
-/// What an Adam step makes of some parameters and their moments, from a scaled loss in mixed precision: then also the scale,
-/// and a mask that says whether all gradients were finite. Where they were not, nothing changes.
+/// Whether a step of this precision scales its loss: the halves of a GPU (f16) end at 65504, those of the CPU (bfloat16) have
+/// the exponents of single precision.
+pub fn scales_loss(precision: Precision, target: TargetKind) -> bool {
+    precision == Precision::Mixed && target == TargetKind::Gpu
+}
+
+/// What an Adam step makes of some parameters and their moments. From a scaled loss also the scale, and a mask that says
+/// whether all gradients were finite; where they were not, nothing changes.
 #[track_caller]
-fn adam(
-    loss: &Tensor,
-    all: &[(&Tensor, &StepScalars)],
-    precision: Precision,
-) -> (Updates, Option<(LossScale, Tensor)>) {
+fn adam(loss: &Tensor, all: &[(&Tensor, &StepScalars)], scaled: bool) -> (Updates, Option<(LossScale, Tensor)>) {
     let wanted: Vec<&Tensor> = all.iter().map(|(p, _)| *p).collect();
-    let scale = (precision == Precision::Mixed).then(LossScale::new);
+    let scale = scaled.then(LossScale::new);
     let gradients = grad(&scale.as_ref().map_or(loss.clone(), |s| s.scaled(loss)), &wanted);
     let scale = scale.map(|s| (s, LossScale::finite(&gradients)));
     let mut updates = vec![];
@@ -84,17 +87,17 @@ fn adam(
     (updates, scale)
 }
 
-/// What an Adam step makes of one parameter and its moments. In mixed precision the loss is scaled as the last training step
-/// would have it.
+/// What an Adam step makes of one parameter and its moments, from a loss that is `scaled` as the last training step would
+/// have it.
 #[track_caller]
-pub fn update_of(loss: &Tensor, parameter: &Tensor, scalars: &StepScalars, precision: Precision) -> Updates {
-    adam(loss, &[(parameter, scalars)], precision).0
+pub fn update_of(loss: &Tensor, parameter: &Tensor, scalars: &StepScalars, scaled: bool) -> Updates {
+    adam(loss, &[(parameter, scalars)], scaled).0
 }
 
-/// What an Adam step makes of every trained parameter and its moments; field and warp have learning rates of their own. In
-/// mixed precision the loss is scaled.
+/// What an Adam step makes of every trained parameter and its moments; field and warp have learning rates of their own. The
+/// loss may be `scaled`.
 #[track_caller]
-pub fn updates(total: &Tensor, field: &[Parameter], warp: &[Parameter], precision: Precision) -> Updates {
+pub fn updates(total: &Tensor, field: &[Parameter], warp: &[Parameter], scaled: bool) -> Updates {
     let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
     let scalars = |lr| StepScalars { lr: scalar(lr), bias1: scalar(BIAS1), bias2: scalar(BIAS2) };
     let (of_field, of_warp) = (scalars(LR_FIELD), scalars(LR_WARP));
@@ -102,7 +105,7 @@ pub fn updates(total: &Tensor, field: &[Parameter], warp: &[Parameter], precisio
         .chain(warp.iter().map(|p| (p, &of_warp)))
         .filter_map(|(p, scalars)| p.trained.then_some((&p.tensor, scalars)))
         .collect();
-    let (mut updates, scale) = adam(total, &all, precision);
+    let (mut updates, scale) = adam(total, &all, scaled);
     updates.extend(scale.into_iter().flat_map(|(scale, finite)| scale.updates(&finite)));
     updates
 }

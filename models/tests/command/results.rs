@@ -146,6 +146,11 @@ fn bench_prints_the_numbers_of_a_step() {
     // Products of pairs on the CPU.
     let text = w.succeed(&["bench", "tiny.toml", "--steps", "1", "--device", "cpu", "--precision", "mixed"]);
     assert!(text.contains("bf16 products"), "{text}");
+    // They need no scaled loss; f16 on a GPU does.
+    for (target, scaled) in [("cpu", false), ("gpu", true)] {
+        let text = w.succeed(&["explain", "tiny.toml", "--precision", "mixed", "--target", target]);
+        assert_eq!(text.contains("loss_scale"), scaled, "{text}");
+    }
     // Launch by launch, for scripts, for people and for Perfetto.
     let text = w.succeed(&["bench", "tiny.toml", "--steps", "1", "--json", "--launches", "--trace", "trace.json"]);
     let bench: Value = serde_json::from_str(&text).unwrap();

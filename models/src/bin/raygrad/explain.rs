@@ -8,6 +8,7 @@ use raygrad::radiance::data::SpaceDataError;
 use raygrad::radiance::{RadianceModel, SpaceData};
 use raygrad::run::files::write_atomically;
 use raygrad::warps;
+use raygrad_compiler::fuse::TargetKind;
 use raygrad_compiler::graph::topological;
 use raygrad_compiler::{Program, Step, Target, compile};
 use std::path::PathBuf;
@@ -53,9 +54,9 @@ enum TargetChoice {
 pub fn run(args: &ExplainArgs) -> anyhow::Result<ExitCode> {
     let experiment = args.choice.experiment()?;
     experiment.layered.validate().map_err(raygrad::Error::from)?;
-    let (step, recorded) = record(&experiment)?;
     let gpu = args.target == TargetChoice::Gpu || matches!(args.emit, Some(Artefact::Wgsl | Artefact::Spirv));
     let target = if gpu { Target::gpu() } else { Target::cpu() };
+    let (step, recorded) = record(&experiment, target.kind)?;
     let program = compile(&step, &target).map_err(raygrad::Error::from)?;
     let files = match args.emit {
         None => vec![("explain.txt".to_string(), program.to_string().into_bytes())],
@@ -87,7 +88,7 @@ pub fn run(args: &ExplainArgs) -> anyhow::Result<ExitCode> {
 }
 
 /// The training step, and how long it took to record and differentiate it.
-fn record(experiment: &Experiment) -> Result<(Step, Duration), raygrad::Error> {
+fn record(experiment: &Experiment, target: TargetKind) -> Result<(Step, Duration), raygrad::Error> {
     let settings = &experiment.layered.settings;
     if settings.scene.is_some() {
         let data = SpaceData::load(&experiment.layered, &|_, _| {})?;
@@ -95,12 +96,12 @@ fn record(experiment: &Experiment) -> Result<(Step, Duration), raygrad::Error> {
         let begun = Instant::now();
         let warp = warps::of_settings(settings, views);
         let model = RadianceModel::new(settings, data.size, views, warp).map_err(SpaceDataError::from)?;
-        return Ok((model.train_step(), begun.elapsed()));
+        return Ok((model.for_target(target).train_step(), begun.elapsed()));
     }
     let data = PlanarData::load(&experiment.layered)?;
     let begun = Instant::now();
     let warp = warps::of_settings(settings, settings.data.patches);
-    Ok((PlanarModel::new(settings, data.grid, warp).train_step(), begun.elapsed()))
+    Ok((PlanarModel::new(settings, data.grid, warp).for_target(target).train_step(), begun.elapsed()))
 }
 
 /// A file a kernel, numbered in the order in which they run.
