@@ -1,5 +1,5 @@
-//! One training step, planar or in space: raygrad against PyTorch and JAX, alternating in one run, with the multiply-add peak of the
-//! same minutes and each program's memory.
+//! One training step, planar or in space: raygrad against PyTorch and JAX, alternating in one run, in f32 and, if asked for, in
+//! bf16, with the peak of the same minutes and each program's memory.
 //!
 //! Speeds on a shared machine drift: every number is a median over rounds, and every ratio is taken within a round first.
 
@@ -19,6 +19,10 @@ struct Args {
     rows: Option<usize>,
     #[arg(long, default_value_t = 2)]
     threads: usize,
+    /// Also the first step in mixed precision, against PyTorch's bf16 autocast and JAX in bf16. For CPUs with dot products of
+    /// bfloat16; elsewhere raygrad computes them from single precision, and slower.
+    #[arg(long)]
+    mixed: bool,
 }
 
 /// A step that raygrad and its peers take.
@@ -88,32 +92,42 @@ sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name='__main__')
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6, 'MB')";
 
+/// A program that takes a step.
+struct Program {
+    name: String,
+    kind: Kind,
+    /// Compared with this one, by its place in the list.
+    against: Option<usize>,
+    runs: Vec<Timed>,
+    /// What this device did at best while it ran; raygrad measures it.
+    peaks: Vec<f64>,
+}
+
+#[derive(Clone, Copy)]
+enum Kind {
+    Raygrad { preset: &'static str, precision: &'static str },
+    Peer { module: &'static str, dtype: &'static str },
+}
+
 fn main() -> anyhow::Result<()> {
     let mut args = Args::parse();
     if quick() {
         (args.rounds, args.rows) = (1, Some(64));
     }
-    let presets = args.work.presets();
-    let there = |(_, module): &(&str, &str)| args.programs.has(module, &format!("import {module}, numpy"));
-    let peers: Vec<(&str, &str)> = [("PyTorch", "torch"), ("JAX", "jax")].into_iter().filter(there).collect();
-    let mut own: Vec<Vec<(Timed, f64)>> = vec![vec![]; presets.len()];
-    let mut others: Vec<Vec<Timed>> = vec![vec![]; peers.len()];
+    let mut programs = args.list();
     for round in 1..=args.rounds {
-        for i in 0..presets.len().max(peers.len()) {
-            if let Some(preset) = presets.get(i) {
-                let (timed, peak) = args.own(preset)?;
-                let share = 100.0 * timed.gflop / timed.seconds / peak;
-                eprintln!("round {round}: {preset} {:.4} s, peak {peak:.0} GFLOP/s ({share:.0} %)", timed.seconds);
-                own[i].push((timed, peak));
-            }
-            if let Some((name, module)) = peers.get(i) {
-                let timed = args.peer(module)?;
-                eprintln!("round {round}: {name} {:.4} s", timed.seconds);
-                others[i].push(timed);
-            }
+        for program in &mut programs {
+            let (timed, peak) = match program.kind {
+                Kind::Raygrad { preset, precision } => args.own(preset, precision)?,
+                Kind::Peer { module, dtype } => (args.peer(module, dtype)?, f64::NAN),
+            };
+            let of_peak = if peak.is_nan() { String::new() } else { format!(", peak {peak:.0} GFLOP/s") };
+            eprintln!("round {round}: {} {:.4} s{of_peak}", program.name, timed.seconds);
+            program.runs.push(timed);
+            program.peaks.push(peak);
         }
     }
-    args.print(&peers, &own, &others);
+    args.print(&programs);
     Ok(())
 }
 
@@ -122,9 +136,38 @@ impl Args {
         self.rows.unwrap_or(self.work.rows())
     }
 
-    fn own(&self, preset: &str) -> anyhow::Result<(Timed, f64)> {
+    /// What takes turns: the steps of raygrad and its peers, in single precision and, if asked for, in mixed.
+    fn list(&self) -> Vec<Program> {
+        let mut all: Vec<Program> = vec![];
+        let mut add = |name: String, kind, against| {
+            all.push(Program { name, kind, against, runs: vec![], peaks: vec![] });
+            all.len() - 1
+        };
+        let presets = self.work.presets();
+        let there = |(_, module): &(&str, &'static str)| self.programs.has(module, &format!("import {module}, numpy"));
+        let peers: Vec<(&str, &'static str)> =
+            [("PyTorch", "torch"), ("JAX", "jax")].into_iter().filter(there).collect();
+        let first =
+            add(format!("raygrad {}", presets[0]), Kind::Raygrad { preset: presets[0], precision: "f32" }, None);
+        for (name, module) in &peers {
+            add(name.to_string(), Kind::Peer { module, dtype: "f32" }, Some(first));
+        }
+        for preset in &presets[1..] {
+            add(format!("raygrad {preset}"), Kind::Raygrad { preset, precision: "f32" }, None);
+        }
+        if self.mixed {
+            let kind = Kind::Raygrad { preset: presets[0], precision: "mixed" };
+            let mixed = add(format!("raygrad {}, mixed", presets[0]), kind, Some(first));
+            for (name, module) in &peers {
+                add(format!("{name}, bf16"), Kind::Peer { module, dtype: "bf16" }, Some(mixed));
+            }
+        }
+        all
+    }
+
+    fn own(&self, preset: &str, precision: &str) -> anyhow::Result<(Timed, f64)> {
         let mut command = self.programs.bench(preset);
-        command.args(["--device", "cpu", "--threads", &self.threads.to_string()]);
+        command.args(["--device", "cpu", "--precision", precision, "--threads", &self.threads.to_string()]);
         command.args(["--set", &format!("{}={}", self.work.setting(), self.rows())]);
         if quick() {
             command.args(["--steps", "2"]);
@@ -137,10 +180,11 @@ impl Args {
         Ok((timed, bench.peak_gflops))
     }
 
-    fn peer(&self, module: &str) -> anyhow::Result<Timed> {
+    fn peer(&self, module: &str, dtype: &str) -> anyhow::Result<Timed> {
         let script = self.programs.script(&format!("{module}_step.py"));
         let mut command = self.programs.python();
         command.args(["-c", MEASURED]).arg(script).args(self.work.of_peers()).arg(self.rows().to_string());
+        command.args(["--dtype", dtype]);
         if module == "torch" {
             command.args(["--threads", &self.threads.to_string()]);
         }
@@ -149,42 +193,40 @@ impl Args {
         Ok(Timed { seconds: before("s/step")?, gflop: before("GFLOP/step")?, rss_mb: before("MB")? })
     }
 
-    fn print(&self, peers: &[(&str, &str)], own: &[Vec<(Timed, f64)>], others: &[Vec<Timed>]) {
-        let of = |runs: &[Timed], f: &dyn Fn(&Timed) -> f64| median(&runs.iter().map(f).collect::<Vec<_>>());
-        let peaks: Vec<Vec<f64>> = own.iter().map(|runs| runs.iter().map(|r| r.1).collect()).collect();
-        let timed: Vec<Vec<Timed>> = own.iter().map(|runs| runs.iter().map(|r| r.0).collect()).collect();
-        let ratios = |a: &[Timed], b: &[Timed], f: fn(&Timed) -> f64| {
-            median(&a.iter().zip(b).map(|(a, b)| f(a) / f(b)).collect::<Vec<_>>())
+    fn print(&self, programs: &[Program]) {
+        let ratios = |a: &Program, b: &Program, f: fn(&Timed) -> f64| {
+            median(&a.runs.iter().zip(&b.runs).map(|(a, b)| f(a) / f(b)).collect::<Vec<_>>())
         };
         let rate = |t: &Timed| t.gflop / t.seconds;
         println!(
-            "{}, f32, {} threads, medians of {} rounds; peak {:.0} GFLOP/s (multiply-adds from registers)\n",
+            "{}, {} threads, medians of {} rounds; peak of f32 {:.0} GFLOP/s (multiply-adds from registers)\n",
             self.work.title(self.rows()),
             self.threads,
             self.rounds,
-            median(&peaks.concat())
+            median(&programs[0].peaks)
         );
         let mut table =
-            Table::new(&["program", "s/step", "GFLOP/step", "GFLOP/s", "of the peak", "memory, MB", "against raygrad"]);
-        let mut row = |name: &str, runs: &[Timed], peaks: &[f64], against: String| {
-            let shares: Vec<f64> = runs.iter().zip(peaks).map(|(t, peak)| 100.0 * rate(t) / peak).collect();
+            Table::new(&["program", "s/step", "GFLOP/step", "GFLOP/s", "of the peak", "memory, MB", "compared"]);
+        for program in programs {
+            let of = |f: &dyn Fn(&Timed) -> f64| median(&program.runs.iter().map(f).collect::<Vec<_>>());
+            let against = program.against.map(|i| &programs[i]);
+            // A peer's rate is compared with what raygrad found beside it, of the same products.
+            let peaks = if let Kind::Peer { .. } = program.kind { against.unwrap_or(program) } else { program };
+            let shares: Vec<f64> =
+                program.runs.iter().zip(&peaks.peaks).map(|(t, peak)| 100.0 * rate(t) / peak).collect();
+            let compared = against.map_or(String::new(), |other| {
+                let (slower, larger) = (ratios(program, other, |t| t.seconds), ratios(program, other, |t| t.rss_mb));
+                format!("{slower:.2} x the time, {larger:.1} x the memory of {}", other.name)
+            });
             table.row([
-                name.to_string(),
-                format!("{:.4}", of(runs, &|t| t.seconds)),
-                format!("{:.1}", of(runs, &|t| t.gflop)),
-                format!("{:.1}", of(runs, &rate)),
+                program.name.clone(),
+                format!("{:.4}", of(&|t| t.seconds)),
+                format!("{:.1}", of(&|t| t.gflop)),
+                format!("{:.1}", of(&rate)),
                 format!("{:.0} %", median(&shares)),
-                format!("{:.0}", of(runs, &|t| t.rss_mb)),
-                against,
+                format!("{:.0}", of(&|t| t.rss_mb)),
+                compared,
             ]);
-        };
-        for (i, preset) in self.work.presets().iter().enumerate() {
-            row(&format!("raygrad {preset}"), &timed[i], &peaks[i], String::new());
-        }
-        for ((name, _), runs) in peers.iter().zip(others) {
-            let slower = ratios(runs, &timed[0], |t| t.seconds);
-            let larger = ratios(runs, &timed[0], |t| t.rss_mb);
-            row(name, runs, &peaks[0], format!("{slower:.2} x the time, {larger:.1} x the memory"));
         }
         println!("{table}");
     }
