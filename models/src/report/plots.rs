@@ -75,9 +75,12 @@ fn draw(svg: &mut String, what: &str, curves: &[Curve], last: f64, (low, high): 
                     drawn.label(&curve.label).legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], style));
                 }
             }
-            let mut labels = chart.configure_series_labels();
-            labels.position(SeriesLabelPosition::UpperRight).label_font((FONT, 13));
-            labels.background_style(WHITE.mix(0.85)).draw()?;
+            if curves.len() > 1 {
+                let height = |y: f64| if log { (y / low).ln() / (high / low).ln() } else { (y - low) / (high - low) };
+                let mut labels = chart.configure_series_labels();
+                labels.position(corner(curves, last, height)).label_font((FONT, 13));
+                labels.background_style(WHITE.mix(0.85)).draw()?;
+            }
         }};
     }
     if log {
@@ -87,6 +90,24 @@ fn draw(svg: &mut String, what: &str, curves: &[Curve], last: f64, (low, high): 
     }
     root.present()?;
     Ok(())
+}
+
+/// The corner of a plot where the fewest points lie under the labels of its curves. `height`: of a value, from 0 to 1.
+fn corner(curves: &[Curve], last: f64, height: impl Fn(f64) -> f64) -> SeriesLabelPosition {
+    use SeriesLabelPosition::{LowerLeft, LowerRight, UpperLeft, UpperRight};
+    // About a quarter of the width, and a line of text for each curve.
+    let (wide, tall) = (0.25, 0.06 * curves.len() as f64 + 0.04);
+    let under = |right: bool, upper: bool| {
+        let points = curves.iter().flat_map(|c| &c.points).map(|(x, y)| (x / last, height(*y)));
+        let inside = points.filter(|(x, y)| {
+            (if right { *x > 1.0 - wide } else { *x < wide }) && (if upper { *y > 1.0 - tall } else { *y < tall })
+        });
+        inside.count()
+    };
+    let corners =
+        [(UpperRight, true, true), (LowerRight, true, false), (UpperLeft, false, true), (LowerLeft, false, false)];
+    let least = corners.into_iter().min_by_key(|(_, right, upper)| under(*right, *upper));
+    least.map_or(UpperRight, |(position, ..)| position)
 }
 
 fn style(curve: &Curve) -> ShapeStyle {
@@ -106,6 +127,19 @@ fn number(y: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn labels_lie_where_curves_do_not() {
+        let curve = |slope: f64| {
+            let points = (0..=100).map(|i| (f64::from(i), 50.0 + slope * f64::from(i - 50))).collect();
+            Curve { label: "a".into(), color: [0; 3], width: 2, points }
+        };
+        let of = |curves: &[Curve]| corner(curves, 100.0, |y| y / 100.0);
+        assert!(matches!(of(&[curve(1.0), curve(0.9)]), SeriesLabelPosition::LowerRight));
+        assert!(matches!(of(&[curve(-1.0), curve(-0.9)]), SeriesLabelPosition::UpperRight));
+        let flat = |y: f64| Curve { points: vec![(100.0, y), (90.0, y)], ..curve(0.0) };
+        assert!(matches!(of(&[flat(0.0), flat(100.0), curve(0.0)]), SeriesLabelPosition::UpperLeft));
+    }
 
     #[test]
     fn plots_of_anything_finite_or_not() {
