@@ -51,11 +51,25 @@ pub enum SpaceDataError {
 impl SpaceData {
     /// Loads the scene, and draws or loads the poses to start from. `progress` hears how many images of how many are there.
     pub fn load(layered: &Layered, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<SpaceData, SpaceDataError> {
+        SpaceData::load_at(layered, sections(&layered.settings)?.0.image_size, progress)
+    }
+
+    /// The same for those who look at no picture: they are tiny, which saves the time of making the built-in ones.
+    pub fn outline(layered: &Layered) -> Result<SpaceData, SpaceDataError> {
+        SpaceData::load_at(layered, [8, 8], &|_, _| {})
+    }
+
+    /// With pictures of this height and width, whatever the settings say.
+    fn load_at(
+        layered: &Layered,
+        picture: [usize; 2],
+        progress: &(dyn Fn(usize, usize) + Sync),
+    ) -> Result<SpaceData, SpaceDataError> {
         let settings = &layered.settings;
         let (wanted, ..) = sections(settings)?;
         let [height, width] = wanted.image_size;
         let options = LoadOptions {
-            size: Some([height, width]),
+            size: Some(picture),
             train_limit: wanted.train_views.limit(),
             val_limit: wanted.val_views.limit(),
             test_limit: wanted.test_views.limit(),
@@ -66,9 +80,9 @@ impl SpaceData {
         let scene = match wanted.path.as_str() {
             BUILTIN => {
                 let folder = tempfile::tempdir().map_err(|source| WriteError { path: std::env::temp_dir(), source })?;
-                let made = MakeOptions { views: VIEWS, size: height.max(width), seed: 0 };
-                make_scene(folder.path(), &made, &|_, _| {})?;
-                scene::load(folder.path(), &options, progress)?
+                let made = MakeOptions { views: VIEWS, size: picture[0].max(picture[1]), seed: 0 };
+                make_scene(folder.path(), &made, progress)?;
+                scene::load(folder.path(), &options, &|_, _| {})?
             }
             path => scene::load(Path::new(path), &options, progress)?,
         };

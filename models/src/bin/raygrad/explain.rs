@@ -91,7 +91,8 @@ pub fn run(args: &ExplainArgs) -> anyhow::Result<ExitCode> {
 fn record(experiment: &Experiment, target: TargetKind) -> Result<(Step, Duration), raygrad::Error> {
     let settings = &experiment.layered.settings;
     if settings.scene.is_some() {
-        let data = SpaceData::load(&experiment.layered, &|_, _| {})?;
+        let data = SpaceData::outline(&experiment.layered)?;
+        let settings = &data.with_depths(settings);
         let views = data.scene.train.len();
         let begun = Instant::now();
         let warp = warps::of_settings(settings, views);

@@ -25,6 +25,9 @@ struct Solid {
     /// World to the solid's own frame.
     place: Pose,
     texture: Texture,
+    /// A ball around it: centre, and radius squared.
+    center: V,
+    reach: f64,
 }
 
 struct Texture {
@@ -46,7 +49,7 @@ impl World {
         let mut random = Random::new(seed, "solids");
         let mut solids = vec![];
         let ground = Texture::new(&mut random, 4.0, true);
-        solids.push(Solid { form: Form::Disc(1.15), place: place(V::new(0.0, 0.0, GROUND), 0.0), texture: ground });
+        solids.push(Solid::new(Form::Disc(1.15), V::new(0.0, 0.0, GROUND), 0.0, ground));
         let forms = [
             (Form::Sphere(0.42), -0.45, -0.35),
             (Form::Block(V::new(0.28, 0.28, 0.5)), 0.45, 0.3),
@@ -65,15 +68,25 @@ impl World {
             };
             let texture = Texture::new(&mut random, 5.0 + i as f64, i % 2 == 1);
             let turn = std::f64::consts::TAU * random.uniform();
-            solids.push(Solid { form, place: place(V::new(x + dx, y + dy, GROUND + height), turn), texture });
+            solids.push(Solid::new(form, V::new(x + dx, y + dy, GROUND + height), turn, texture));
         }
         World { solids, light: V::new(0.4, -0.5, 0.9).normalize() }
     }
 
     /// The nearest solid along a ray, and where: (parameter, normal in the world, solid).
     fn hit(&self, origin: &V, direction: &V) -> Option<(f64, V, &Solid)> {
-        let hits = self.solids.iter().filter_map(|s| s.hit(origin, direction).map(|(t, normal)| (t, normal, s)));
+        let hits = self.near(origin, direction).filter_map(|s| s.hit(origin, direction).map(|(t, n)| (t, n, s)));
         hits.min_by(|a, b| a.0.total_cmp(&b.0))
+    }
+
+    /// The solids whose balls a ray's line passes through: a cheap test first.
+    fn near(&self, origin: &V, direction: &V) -> impl Iterator<Item = &Solid> {
+        let (origin, direction, length) = (*origin, *direction, direction.norm_squared());
+        self.solids.iter().filter(move |s| {
+            let from = origin - s.center;
+            let along = from.dot(&direction);
+            (from.norm_squared() - s.reach) * length <= along * along
+        })
     }
 
     /// Parameter of the first hit.
@@ -85,7 +98,8 @@ impl World {
     pub fn color(&self, origin: &V, direction: &V) -> Option<V> {
         let (t, normal, solid) = self.hit(origin, direction)?;
         let at = origin + t * direction;
-        let shadow = self.hit(&(at + OFFSET * normal), &self.light).is_some();
+        let above = at + OFFSET * normal;
+        let shadow = self.near(&above, &self.light).any(|s| s.hit(&above, &self.light).is_some());
         let diffuse = if shadow { 0.0 } else { normal.dot(&self.light).max(0.0) };
         Some(solid.texture.at(&solid.place.apply(&at)) * (AMBIENT + (1.0 - AMBIENT) * diffuse))
     }
@@ -98,6 +112,16 @@ fn place(center: V, turn: f64) -> Pose {
 }
 
 impl Solid {
+    fn new(form: Form, center: V, turn: f64, texture: Texture) -> Solid {
+        let radius = match &form {
+            Form::Sphere(radius) | Form::Disc(radius) => *radius,
+            Form::Block(half) => half.norm(),
+        };
+        // A little larger, so that rounding takes no hit away.
+        let reach = 1.001 * radius * radius;
+        Solid { form, place: place(center, turn), texture, center, reach }
+    }
+
     /// Nearest positive parameter and the normal towards the ray's origin.
     fn hit(&self, origin: &V, direction: &V) -> Option<(f64, V)> {
         let (o, d) = (self.place.apply(origin), self.place.rotation * direction);
@@ -148,40 +172,55 @@ impl Texture {
             let cells: f64 = (p * f + V::new(0.25, 0.25, 0.5)).iter().map(|x| x.floor()).sum();
             cells.rem_euclid(2.0)
         } else {
-            let wave = 1.5 * noise(&(p * f * 0.7), self.seed ^ 0x55);
+            let wave = 1.5 * Cell::at(&(p * f * 0.7)).noise(self.seed ^ 0x55);
             0.5 + 0.5 * (2.0 * f * (p.z + 0.4 * p.x) + 4.0 * wave).sin()
         };
         let base = self.colors[0].lerp(&self.colors[1], pattern);
+        let octaves: [Cell; 4] = std::array::from_fn(|k| Cell::at(&(p * 3.0 * f64::from(1u32 << k))));
         let speckle = V::from_fn(|channel, _| {
-            let octave = |k: u32| {
-                let scale = f64::from(1u32 << k);
-                noise(&(p * 3.0 * scale), self.seed.wrapping_add(31 * k + 7 * channel as u32)) / scale.sqrt()
+            let octave = |(k, cell): (u32, &Cell)| {
+                let seed = self.seed.wrapping_add(31 * k + 7 * channel as u32);
+                cell.noise(seed) / f64::from(1u32 << k).sqrt()
             };
-            (0..4).map(octave).sum::<f64>() / 2.6
+            (0..).zip(&octaves).map(octave).sum::<f64>() / 2.6
         });
         (base + (speckle - V::repeat(0.5)) * 0.7).map(|c| c.clamp(0.02, 1.0))
     }
 }
 
-/// Smooth noise in 0..=1 with one value a unit cell corner.
-fn noise(p: &V, seed: u32) -> f64 {
-    let cell = p.map(f64::floor);
-    let f = (p - cell).map(|x| x * x * (3.0 - 2.0 * x));
-    let corner = |i: usize| {
-        let bit = |axis: usize| (i >> axis & 1) as i32;
-        let at = |axis: usize| (cell[axis] as i32 + bit(axis)) as u32;
-        let weight = |axis: usize| if bit(axis) == 1 { f[axis] } else { 1.0 - f[axis] };
-        weight(0) * weight(1) * weight(2) * hash([at(0), at(1), at(2), seed])
-    };
-    (0..8).map(corner).sum()
+/// Where a point lies among the corners of its unit cell: what noise of any seed there has in common.
+struct Cell {
+    weights: [f64; 8],
+    /// Of the corners' coordinates.
+    hashes: [u32; 8],
 }
 
-/// Four numbers to one in 0..1 (multiply and xor-shift).
-fn hash(parts: [u32; 4]) -> f64 {
-    let mixed = parts.iter().fold(0x9e37_79b9u32, |h, part| {
-        let h = (h ^ part).wrapping_mul(0x7feb_352d);
-        let h = (h ^ (h >> 15)).wrapping_mul(0x846c_a68b);
-        h ^ (h >> 16)
-    });
-    f64::from(mixed) / f64::from(u32::MAX)
+impl Cell {
+    fn at(p: &V) -> Cell {
+        let cell = p.map(f64::floor);
+        let f = (p - cell).map(|x| x * x * (3.0 - 2.0 * x));
+        let bit = |i: usize, axis: usize| i >> axis & 1;
+        let weight = |i: usize, axis: usize| if bit(i, axis) == 1 { f[axis] } else { 1.0 - f[axis] };
+        let at = |axis: usize, bit: usize| (cell[axis] as i32 + bit as i32) as u32;
+        // Corners that share coordinates share the beginning of their hash.
+        let x: [u32; 2] = std::array::from_fn(|i| mix(0x9e37_79b9, at(0, i)));
+        let xy: [u32; 4] = std::array::from_fn(|i| mix(x[bit(i, 0)], at(1, bit(i, 1))));
+        Cell {
+            weights: std::array::from_fn(|i| weight(i, 0) * weight(i, 1) * weight(i, 2)),
+            hashes: std::array::from_fn(|i| mix(xy[i & 3], at(2, bit(i, 2)))),
+        }
+    }
+
+    /// Smooth noise in 0..=1 with one value a corner.
+    fn noise(&self, seed: u32) -> f64 {
+        let value = |hash: u32| f64::from(mix(hash, seed)) / f64::from(u32::MAX);
+        self.weights.iter().zip(&self.hashes).map(|(weight, hash)| weight * value(*hash)).sum()
+    }
+}
+
+/// One more part of a hash (multiply and xor-shift).
+fn mix(hash: u32, part: u32) -> u32 {
+    let h = (hash ^ part).wrapping_mul(0x7feb_352d);
+    let h = (h ^ (h >> 15)).wrapping_mul(0x846c_a68b);
+    h ^ (h >> 16)
 }
