@@ -15,7 +15,8 @@ use raygrad_compiler::ops::input::{Input, Role};
 use raygrad_compiler::reference::{Array, Bindings, evaluate};
 use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Program, Step, Target, compile};
-use raygrad_tests::backend::devices_for_large_programs;
+use raygrad_runtime::{Device, Precision};
+use raygrad_tests::backend::{devices_for_large_programs, reference, round, run};
 use raygrad_tests::check::check;
 use raygrad_tests::{Rng, seed, total};
 use std::collections::HashMap;
@@ -205,6 +206,43 @@ fn plain_networks() {
     check_model("inn-blender", &["warp.method=mlp"]);
     check_model("inn-blender", &["warp.method=implicit-mlp"]);
     check_model("inn-blender", &["warp.method=se3-field", "warp.output_scale=[0.5,2.0]"]);
+}
+
+/// Whole steps with products of bfloat16 on the CPU: the loss, and gradients of first and second order. Operands have 8 bits, and
+/// a rectifier near its kink opens or shuts.
+#[test]
+fn mixed_precision_on_the_cpu() {
+    let mixed = Device::cpu(Some(2)).and_then(|d| d.with_precision(Precision::Mixed)).unwrap_or_else(|e| panic!("{e}"));
+    for preset in ["nerf-blender", "l2g-blender", "inn-llff", "garf-llff"] {
+        let model = model(preset, &["train.rays=48", "train.samples=16", "loss.alignment=100.0"]);
+        let loss = output(&model.train_step(), "total");
+        let parameters: Vec<Tensor> = model.parameters().into_iter().map(|p| p.tensor).collect();
+        let wanted: Vec<&Tensor> = parameters.iter().collect();
+        let first = grad(&loss, &wanted);
+        let squares = first.iter().map(|g| total(&(g * g))).reduce(|a, b| a + b).expect("parameters");
+        let second = grad(&squares, &wanted);
+        for (what, values, tolerance) in [("loss", vec![loss], 1e-3), ("first", first, 0.05), ("second", second, 0.1)] {
+            let outputs = (0..).map(|i: usize| format!("{i}")).zip(values).collect();
+            let step = Step { outputs, updates: vec![] };
+            let bound = round(&bind(&model, &step.roots(), &mut Rng(seed(preset))));
+            let (expected, found) = (reference(&step, &bound), run(&mixed, &step, &bound));
+            let length = |v: &[f64]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
+            let largest = expected.iter().map(|v| length(v)).fold(0.0, f64::max);
+            for (i, (expected, found)) in expected.iter().zip(&found).enumerate() {
+                let difference: Vec<f64> = expected.iter().zip(found).map(|(e, f)| e - f).collect();
+                let (error, size) = (length(&difference), length(expected));
+                println!(
+                    "{preset}, {what} {i}: {error:.1e} of {size:.1e}, largest {largest:.1e}: {:.4}",
+                    error / (size + 0.1 * largest)
+                );
+                // Gradients that nearly cancel keep the errors of what they are sums of.
+                assert!(
+                    error <= tolerance * (size + 0.1 * largest),
+                    "{preset}, {what}, parameter {i}: off by {error:.1e} of {size:.1e}; the largest is {largest:.1e}"
+                );
+            }
+        }
+    }
 }
 
 /// Two fields, the second at depths that the first one's weights give.
