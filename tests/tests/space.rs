@@ -231,10 +231,6 @@ fn mixed_precision_on_the_cpu() {
             for (i, (expected, found)) in expected.iter().zip(&found).enumerate() {
                 let difference: Vec<f64> = expected.iter().zip(found).map(|(e, f)| e - f).collect();
                 let (error, size) = (length(&difference), length(expected));
-                println!(
-                    "{preset}, {what} {i}: {error:.1e} of {size:.1e}, largest {largest:.1e}: {:.4}",
-                    error / (size + 0.1 * largest)
-                );
                 // Gradients that nearly cancel keep the errors of what they are sums of.
                 assert!(
                     error <= tolerance * (size + 0.1 * largest),
