@@ -5,6 +5,7 @@
 
 use super::files::{WriteError, write_atomically};
 use super::metrics::Entry;
+use crate::training::loss_scale;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -109,6 +110,16 @@ impl Checkpoint {
             let values = view.data().as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b)).collect();
             tensors.insert(name.to_string(), Saved { shape: view.shape().to_vec(), values });
         }
+        // A run may go on, or be evaluated, on a device that scales the loss where this one did not, or the other way round.
+        for name in loss_scale::STATES {
+            match expected.get(name) {
+                None => drop(tensors.remove(name)),
+                Some(shape) => {
+                    let zeros = || Saved { shape: shape.clone(), values: vec![0.0; shape.iter().product()] };
+                    tensors.entry(name.to_string()).or_insert_with(zeros);
+                }
+            }
+        }
         check_fit(&path, &tensors, expected)?;
         Ok(Checkpoint { step: manifest.step, seconds: manifest.seconds, steps: manifest.steps, tensors })
     }
@@ -167,6 +178,23 @@ fn check_fit(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_loss_scale_comes_and_goes_with_devices() {
+        let dir = tempfile::tempdir().unwrap();
+        let scale = |values| Saved { shape: vec![1], values };
+        let [held, steps] = loss_scale::STATES.map(str::to_string);
+        let mut saved = example();
+        saved.tensors.extend([(held.clone(), scale(vec![512.0])), (steps.clone(), scale(vec![7.0]))]);
+        saved.save(dir.path()).unwrap();
+        let mut expected = BTreeMap::from([("w".to_string(), vec![2, 3])]);
+        assert_eq!(Checkpoint::load(dir.path(), &expected).unwrap().tensors, example().tensors);
+        expected.extend([(held.clone(), vec![1]), (steps, vec![1])]);
+        assert_eq!(Checkpoint::load(dir.path(), &expected).unwrap().tensors, saved.tensors);
+        // Where there is none, it starts with its first value, which 0 stands for.
+        example().save(dir.path()).unwrap();
+        assert_eq!(Checkpoint::load(dir.path(), &expected).unwrap().tensors[&held].values, [0.0]);
+    }
 
     fn example() -> Checkpoint {
         let saved = Saved { shape: vec![2, 3], values: vec![1.0, -0.0, f32::MIN_POSITIVE, 3.5, 1e-40, 7.0] };

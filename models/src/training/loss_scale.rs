@@ -24,8 +24,10 @@ fn grouped(x: &Tensor, count: usize) -> Tensor {
     x.channel_groups((0..count as u32).map(|first| (first..all).step_by(count).collect()).collect())
 }
 
-/// The scale of a step. States of the session: `loss_scale`, where 0 stands for its first value, and `loss_scale.steps`, the
-/// steps since it last changed.
+/// States of the session: the scale, where 0 stands for its first value, and the steps since it last changed.
+pub const STATES: [&str; 2] = ["loss_scale", "loss_scale.steps"];
+
+/// The scale of a step, see [`STATES`].
 pub struct LossScale {
     held: Tensor,
     steps: Tensor,
@@ -36,7 +38,7 @@ impl LossScale {
     #[track_caller]
     pub fn new() -> LossScale {
         let state = |name| Tensor::input(name, Role::State, Shape::new(&[], 1));
-        let (held, steps) = (state("loss_scale"), state("loss_scale.steps"));
+        let [held, steps] = STATES.map(state);
         let scale = held.equal(&Tensor::scalar(0.0)).select(&Tensor::scalar(START), &held);
         LossScale { held, steps, scale }
     }

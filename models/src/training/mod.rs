@@ -2,7 +2,7 @@
 //! what a run asks of it.
 
 pub mod learner;
-mod loss_scale;
+pub(crate) mod loss_scale;
 pub mod optimise;
 
 pub use learner::Learner;
