@@ -246,6 +246,16 @@ fn gathers_and_scatters(device: &Device) {
     }
 }
 
+/// Entries of a few units in the fifth place turn eigenvectors far where eigenvalues lie as close.
+fn eigenvectors_of_close_eigenvalues(device: &Device) {
+    let row = Axis::new("row", 40);
+    let small = Tensor::data("small", Shape::new(&[&row], 16)) * 2e-5;
+    let mut diagonal = [0.0; 16];
+    (diagonal[0], diagonal[5], diagonal[10], diagonal[15]) = (1.0, 1.0001, 2.0, 3.0);
+    let (values, vectors) = (small + Tensor::constant(&diagonal)).reshape((4, 4)).sym_eig();
+    check(device, vec![("values", values), ("vectors", vectors)], 5e-3, "close eigenvalues");
+}
+
 fn compositing(device: &Device) {
     let (ray, sample) = (Axis::new("ray", 500), Axis::new("sample", 40));
     let density = Tensor::parameter("density", Shape::new(&[&ray, &sample], 1));
@@ -465,6 +475,7 @@ macro_rules! on_every_backend {
 on_every_backend!(
     layers_of_all_widths,
     halves,
+    eigenvectors_of_close_eigenvalues,
     elements_four_at_a_time,
     totals_of_layers,
     concatenations_of_layers,

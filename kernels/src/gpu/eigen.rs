@@ -47,9 +47,7 @@ fn rotate(b: &mut Builder, a: Memory, v: Memory, p: Value, q: Value, n: Value) {
     let zero = b.f(0.0);
     // Below half a unit in the last place of both diagonal entries: nothing left to do.
     let counts = |b: &mut Builder, diagonal: Value| {
-        let part = b.f(1e-3);
         let (size, off) = (b.math(Math::Abs, &[diagonal]), b.math(Math::Abs, &[apq]));
-        let off = b.mul(part, off);
         let sum = b.add(size, off);
         b.binary(Op::NotEqual, sum, size)
     };
