@@ -42,6 +42,10 @@ pub fn pack_panels(products: Products, w: &[f32], k: usize, n: usize, transposed
             }
         } else {
             for (slots, rows) in panel.chunks_exact_mut(PANEL).zip(w.chunks(n * values)) {
+                if products == Products::F32 {
+                    slots[..count].copy_from_slice(&rows[first..][..count]);
+                    continue;
+                }
                 let (row, next) = rows.split_at(n);
                 for (i, slot) in slots[..count].iter_mut().enumerate() {
                     *slot = products.lane(row[first + i], next.get(first + i).copied().unwrap_or(0.0));

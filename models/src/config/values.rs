@@ -257,7 +257,7 @@ impl<'de> Deserialize<'de> for ImageSize {
 pub enum Precision {
     #[default]
     F32,
-    /// Matrix products of halves (f16 on GPUs, bf16 on the CPU), with a scaled loss.
+    /// Matrix products of halves: f16 with a scaled loss on GPUs, bf16 on the CPU.
     Mixed,
 }
 
