@@ -64,7 +64,7 @@ fn filled(len: usize) -> AlignedVec {
 fn matrix_kernels(isa: Isa, products: Products, [k, n, rows]: [usize; 3], seconds: f64) {
     let ld = row_stride(rows);
     let (x, mut y, bias) = (filled(k * ld), filled(n * ld), filled(n));
-    let weights = panel_len(products.lanes(k), n);
+    let weights = panel_len(products, k, n);
     let panels = filled(weights * SETS);
     let mut scratch = AlignedVec::zeroed(gemm_scratch(products, k).max(outer_scratch(products, k, n, rows)));
     let scratch = scratch.as_mut_ptr();

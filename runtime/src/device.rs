@@ -231,7 +231,7 @@ impl Device {
             Device::Cpu { pool, products } => {
                 let form = match products {
                     Products::F32 => "",
-                    Products::Bf16 if Isa::detect() == Isa::Avx512Bf16 => ", bf16 products",
+                    Products::Bf16 if Isa::detect().multiplies_pairs() => ", bf16 products",
                     Products::Bf16 => ", bf16 products emulated (slower than f32)",
                 };
                 format!("CPU, {} threads{form}", pool.current_num_threads())

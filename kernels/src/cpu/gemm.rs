@@ -48,11 +48,14 @@ pub struct Gemm {
     pub rows: usize,
 }
 
-/// Lanes of scratch that a product of `contraction` channels takes: a block of rows of the operand in pairs.
+/// Most rows that a kernel multiplies at a time.
+const MOST_ROWS: usize = 2 * ROW_BLOCK;
+
+/// Lanes of scratch that a product of `contraction` channels takes: blocks of rows of the operand in pairs.
 pub fn gemm_scratch(products: Products, contraction: usize) -> usize {
     match products {
         Products::F32 => 0,
-        Products::Bf16 => products.lanes(contraction) * ROW_BLOCK,
+        Products::Bf16 => products.weight_stride(contraction) * MOST_ROWS,
     }
 }
 
@@ -64,7 +67,13 @@ pub fn gemm_scratch(products: Products, contraction: usize) -> usize {
 pub unsafe fn gemm(isa: Isa, args: Gemm) {
     debug_assert_eq!(args.rows % ROW_BLOCK, 0);
     // SAFETY: forwarded contract.
-    unsafe { launch(isa, &args) }
+    unsafe {
+        #[cfg(target_arch = "x86_64")]
+        if (isa, args.products) == (Isa::AmxBf16, Products::Bf16) {
+            return super::amx::gemm(&args);
+        }
+        launch(isa, &args);
+    }
 }
 
 impl Kernel for Gemm {
@@ -104,7 +113,8 @@ impl Gemm {
     /// As [`gemm`], and `NV * S::LANES` divides `rows`.
     #[inline(always)]
     unsafe fn blocks<S: Simd, P: Multiply<S>, const MR: usize, const NV: usize>(&self) {
-        let panel_size = panel_len(P::PRODUCTS.lanes(self.contraction), PANEL);
+        let panel_size = panel_len(P::PRODUCTS, self.contraction, PANEL);
+        let ld = P::PRODUCTS.weight_stride(self.contraction);
         let mut row = 0;
         while row < self.rows {
             // SAFETY: every channel has a block of rows here, and the scratch has room for one.
@@ -118,17 +128,17 @@ impl Gemm {
                 // SAFETY: `output < outputs`, so that its panel exists; each block has `count` outputs left, and
                 // `row + NV * LANES <= rows` since the block height divides `rows`.
                 unsafe {
-                    let panel = self.panels.add(output / PANEL * panel_size + output % PANEL);
+                    let panel = self.panels.add(output / PANEL * panel_size + P::weight(output % PANEL, ld));
                     match count {
-                        1 => self.block::<S, P, 1, NV>(x, panel, output, row),
-                        2 => self.block::<S, P, 2, NV>(x, panel, output, row),
-                        3 => self.block::<S, P, 3, NV>(x, panel, output, row),
+                        1 => self.block::<S, P, 1, NV>(x, panel, ld, output, row),
+                        2 => self.block::<S, P, 2, NV>(x, panel, ld, output, row),
+                        3 => self.block::<S, P, 3, NV>(x, panel, ld, output, row),
                         // Guarded, so that narrow kernels do not compile blocks that they never need.
-                        4 if MR > 4 => self.block::<S, P, 4, NV>(x, panel, output, row),
-                        5 if MR > 4 => self.block::<S, P, 5, NV>(x, panel, output, row),
-                        6 if MR > 4 => self.block::<S, P, 6, NV>(x, panel, output, row),
-                        7 if MR > 4 => self.block::<S, P, 7, NV>(x, panel, output, row),
-                        _ => self.block::<S, P, MR, NV>(x, panel, output, row),
+                        4 if MR > 4 => self.block::<S, P, 4, NV>(x, panel, ld, output, row),
+                        5 if MR > 4 => self.block::<S, P, 5, NV>(x, panel, ld, output, row),
+                        6 if MR > 4 => self.block::<S, P, 6, NV>(x, panel, ld, output, row),
+                        7 if MR > 4 => self.block::<S, P, 7, NV>(x, panel, ld, output, row),
+                        _ => self.block::<S, P, MR, NV>(x, panel, ld, output, row),
                     }
                 }
                 output += count;
@@ -146,12 +156,12 @@ impl Gemm {
         &self,
         x: Channels,
         panel: *const f32,
+        ld_weights: usize,
         output: usize,
         row: usize,
     ) {
         // SAFETY: every access is step `< count` of `x`, or output `output + i` of `bias`, `y` and `h`, at
-        // vector `j` of the block's rows: inside by the contract. `panel + c * PANEL + i` stays in the panel because
-        // `output % PANEL + MR <= PANEL`.
+        // vector `j` of the block's rows: inside by the contract. Weights stay in the panel because `output % PANEL + MR <= PANEL`.
         unsafe {
             let zero = S::splat(0.0);
             let mut acc = [[zero; NV]; MR];
@@ -166,7 +176,7 @@ impl Gemm {
                 if NV > MR {
                     let mut ws = [zero; MR];
                     for i in 0..MR {
-                        ws[i] = S::splat(*weights.add(i));
+                        ws[i] = S::splat(*weights.add(P::weight(i, ld_weights)));
                     }
                     for j in 0..NV {
                         let v = S::load(at.add(j * S::LANES));
@@ -180,7 +190,7 @@ impl Gemm {
                         xs[j] = S::load(at.add(j * S::LANES));
                     }
                     for i in 0..MR {
-                        let w = S::splat(*weights.add(i));
+                        let w = S::splat(*weights.add(P::weight(i, ld_weights)));
                         for j in 0..NV {
                             acc[i][j] = P::multiply_add(w, xs[j], acc[i][j]);
                         }
@@ -188,24 +198,19 @@ impl Gemm {
                 }
                 // `wrapping_add`: after the last step the pointer may lie beyond the end of the tile.
                 at = at.wrapping_add(ld);
-                weights = weights.wrapping_add(PANEL);
+                weights = weights.wrapping_add(P::WEIGHT_STEP);
             }
             self.finish::<S, MR, NV>(&mut acc, output, row);
-            for i in 0..MR {
-                for j in 0..NV {
-                    S::store(self.y.add((output + i) * self.ldy + row + j * S::LANES), acc[i][j]);
-                }
-            }
         }
     }
 
-    /// Applies the old `y` and the epilogue to the accumulators of a block. One loop per case, because the compiler
+    /// Applies the old `y` and the epilogue to the accumulators of a block, and stores them. One loop per case, because the compiler
     /// keeps accumulators in registers only in loops simple enough to be unrolled.
     ///
     /// # Safety
-    /// As [`Gemm::block`].
+    /// As [`gemm`]; the block lies inside `y`.
     #[inline(always)]
-    unsafe fn finish<S: Simd, const MR: usize, const NV: usize>(
+    pub(super) unsafe fn finish<S: Simd, const MR: usize, const NV: usize>(
         &self,
         acc: &mut [[S::V; NV]; MR],
         output: usize,
@@ -238,6 +243,11 @@ impl Gemm {
                             acc[i][j] = S::select(active, acc[i][j], zero);
                         }
                     }
+                }
+            }
+            for i in 0..MR {
+                for j in 0..NV {
+                    S::store(self.y.add((output + i) * self.ldy + row + j * S::LANES), acc[i][j]);
                 }
             }
         }

@@ -4,7 +4,9 @@ use std::fmt;
 /// An instruction set, best first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Isa {
-    /// The same, and dot products of pairs of bfloat16 values: AVX-512 BF16.
+    /// AVX-512 BF16, and products of tiles of bfloat16 pairs: AMX TILE and BF16 (Linux).
+    AmxBf16,
+    /// AVX-512, and dot products of pairs of bfloat16 values: AVX-512 BF16.
     Avx512Bf16,
     /// 512-bit vectors: AVX-512 F, VL, DQ and BW.
     Avx512,
@@ -15,7 +17,7 @@ pub enum Isa {
 }
 
 impl Isa {
-    const ALL: [Isa; 4] = [Isa::Avx512Bf16, Isa::Avx512, Isa::Avx2, Isa::Portable];
+    const ALL: [Isa; 5] = [Isa::AmxBf16, Isa::Avx512Bf16, Isa::Avx512, Isa::Avx2, Isa::Portable];
 
     /// The best instruction set of this machine.
     pub fn detect() -> Isa {
@@ -28,9 +30,17 @@ impl Isa {
         Isa::ALL.into_iter().filter(|isa| isa.supported()).collect()
     }
 
-    /// Whether this machine can run kernels compiled for this instruction set.
+    /// Whether it has instructions for products of bfloat16 values; elsewhere they are computed in single precision.
+    pub fn multiplies_pairs(self) -> bool {
+        matches!(self, Isa::AmxBf16 | Isa::Avx512Bf16)
+    }
+
+    /// Whether this machine can run kernels compiled for this instruction set. The first call asks the kernel for tiles
+    /// where the CPU has them, for the whole process.
     pub fn supported(self) -> bool {
         match self {
+            #[cfg(target_arch = "x86_64")]
+            Isa::AmxBf16 => Isa::Avx512Bf16.supported() && super::amx::allowed(),
             #[cfg(target_arch = "x86_64")]
             Isa::Avx512Bf16 => Isa::Avx512.supported() && is_x86_feature_detected!("avx512bf16"),
             #[cfg(target_arch = "x86_64")]
@@ -44,7 +54,7 @@ impl Isa {
             #[cfg(target_arch = "x86_64")]
             Isa::Avx2 => is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma"),
             #[cfg(not(target_arch = "x86_64"))]
-            Isa::Avx512Bf16 | Isa::Avx512 | Isa::Avx2 => false,
+            Isa::AmxBf16 | Isa::Avx512Bf16 | Isa::Avx512 | Isa::Avx2 => false,
             Isa::Portable => true,
         }
     }
@@ -53,6 +63,7 @@ impl Isa {
 impl fmt::Display for Isa {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
+            Isa::AmxBf16 => "amx_bf16",
             Isa::Avx512Bf16 => "avx512_bf16",
             Isa::Avx512 => "avx512",
             Isa::Avx2 => "avx2",

@@ -69,7 +69,7 @@ impl GemmCase {
         epilogue: &str,
     ) -> AlignedVec {
         let (c, o) = (self.contraction, self.outputs);
-        let mut panels = AlignedVec::zeroed(panel_len(products.lanes(c), o));
+        let mut panels = AlignedVec::zeroed(panel_len(products, c, o));
         let mut scratch = AlignedVec::zeroed(gemm_scratch(products, c) + 1);
         *scratch.last_mut().unwrap() = CANARY;
         let (k, n) = if transposed { (o, c) } else { (c, o) };

@@ -9,6 +9,8 @@
 //! instruction set. Which one runs is an explicit argument ([`Isa`]), so that tests cover all of them on one machine.
 #![allow(clippy::needless_range_loop, reason = "indices name the rows and columns of register blocks")]
 pub mod aligned;
+#[cfg(target_arch = "x86_64")]
+mod amx;
 pub mod gemm;
 pub mod isa;
 pub(crate) mod math;

@@ -74,7 +74,13 @@ pub unsafe fn outer(isa: Isa, args: Outer) {
     debug_assert!(args.first + args.k <= args.channels);
     debug_assert!(args.first.is_multiple_of(PANEL) || !x_along_vectors(args.channels, args.n));
     // SAFETY: forwarded contract.
-    unsafe { launch(isa, &args) }
+    unsafe {
+        #[cfg(target_arch = "x86_64")]
+        if (isa, args.products) == (Isa::AmxBf16, Products::Bf16) {
+            return super::amx::outer(&args);
+        }
+        launch(isa, &args);
+    }
 }
 
 /// Copies (or adds) an accumulator in panels to the row-major `[k][n]` matrix `out`.
@@ -126,19 +132,29 @@ impl Outer {
         // SAFETY: forwarded contract. `NV * LANES` divides `PANEL`.
         unsafe {
             match S::REGISTERS {
-                32.. => self.panels::<S, P, 8, 2, 1>(),
-                16.. => self.panels::<S, P, 3, 4, 2>(),
-                _ => self.panels::<S, P, 2, 2, 1>(),
+                32.. => self.panels::<S, P, 8, 2, 1, false>(),
+                16.. => self.panels::<S, P, 3, 4, 2, false>(),
+                _ => self.panels::<S, P, 2, 2, 1, false>(),
             }
         }
     }
 
-    /// All panels, in blocks of `MR` channels and `NV` vectors, or `HALF` as many at the end of the last panel.
+    /// All panels, in blocks of `MR` channels and `NV` vectors, or `HALF` as many at the end of the last panel; or `IN_TILES`
+    /// (see [`super::amx`]).
     ///
     /// # Safety
     /// As [`outer`], and `NV * S::LANES` divides [`PANEL`].
     #[inline(always)]
-    unsafe fn panels<S: Simd, P: Multiply<S>, const MR: usize, const NV: usize, const HALF: usize>(&self) {
+    pub(super) unsafe fn panels<
+        S: Simd,
+        P: Multiply<S>,
+        const MR: usize,
+        const NV: usize,
+        const HALF: usize,
+        const IN_TILES: bool,
+    >(
+        &self,
+    ) {
         let x = Channels { at: self.x, ld: self.ldx, count: self.k };
         let d = Channels { at: self.d, ld: self.ldd, count: self.n };
         let (vectors, others, height, first) = if x_along_vectors(self.channels, self.n) {
@@ -167,6 +183,12 @@ impl Outer {
                     let from = Channels { at: vectors.at.add(channel * vectors.ld + row), count, ..vectors };
                     transpose::<S>(P::over_rows(from, rows, strip), steps, panel);
                     let g = self.g.add(first + channel * height);
+                    #[cfg(target_arch = "x86_64")]
+                    if IN_TILES {
+                        super::amx::blocks::<S>(panel, count, others, steps, g);
+                        channel += PANEL;
+                        continue;
+                    }
                     let mut column = 0;
                     while column < count {
                         let (panel, g) = (panel.add(column), g.add(column));

@@ -26,11 +26,26 @@ fn rate(isa: Isa, products: Products, limit: Duration) -> f64 {
     let mut flops = 0.0;
     loop {
         // SAFETY: `isa` was detected, and the kernel touches no memory.
-        flops += unsafe { launch(isa, &Chains(products)) };
+        flops += unsafe { steps(isa, products) };
         let elapsed = start.elapsed();
         if elapsed >= limit {
             return flops / elapsed.as_secs_f64() * 1e-9;
         }
+    }
+}
+
+/// Runs one stretch of multiply-adds, and returns the number of operations.
+///
+/// # Safety
+/// `isa.supported()`.
+unsafe fn steps(isa: Isa, products: Products) -> f64 {
+    // SAFETY: forwarded contract.
+    unsafe {
+        #[cfg(target_arch = "x86_64")]
+        if (isa, products) == (Isa::AmxBf16, Products::Bf16) {
+            return super::amx::chains(STEPS);
+        }
+        launch(isa, &Chains(products))
     }
 }
 

@@ -5,6 +5,7 @@
 //! ([`Isa::Avx512Bf16`](super::Isa)). Elsewhere the same numbers are computed from the halves of a lane, slower than in
 //! single precision. Operands are rounded (to nearest, ties to even) where a kernel reads them; nothing is stored so.
 use super::ROW_BLOCK;
+use super::panels::PANEL;
 use super::simd::Simd;
 
 /// What matrix products multiply. Sums are in single precision.
@@ -30,13 +31,9 @@ impl Products {
         values.div_ceil(self.values())
     }
 
-    /// A lane of weights, of one or two neighbours along the sum.
-    pub(super) fn lane(self, first: f32, second: f32) -> f32 {
-        let bits = |x: f32| u32::from(half::bf16::from_f32(x).to_bits());
-        match self {
-            Products::F32 => first,
-            Products::Bf16 => f32::from_bits(bits(first) | bits(second) << 16),
-        }
+    /// Lanes from the weights of one output to those of the next, where neighbours along the sum lie side by side.
+    pub(super) fn weight_stride(self, contraction: usize) -> usize {
+        self.lanes(contraction).next_multiple_of(16)
     }
 }
 
@@ -54,6 +51,11 @@ pub(super) struct Channels {
 /// As [`Simd`].
 pub(super) trait Multiply<S: Simd> {
     const PRODUCTS: Products;
+    /// Lanes from a weight to the next one along the sum, see [`super::panels`].
+    const WEIGHT_STEP: usize;
+
+    /// Lanes from the weight of an output to that of the `i`-th one after it in the same panel, for lines of `ld` lanes.
+    fn weight(i: usize, ld: usize) -> usize;
 
     /// `c` plus the products of what `a` and `b` hold.
     unsafe fn multiply_add(a: S::V, b: S::V, c: S::V) -> S::V;
@@ -85,6 +87,12 @@ pub(super) struct Singles;
 
 impl<S: Simd> Multiply<S> for Singles {
     const PRODUCTS: Products = Products::F32;
+    const WEIGHT_STEP: usize = PANEL;
+
+    #[inline(always)]
+    fn weight(i: usize, _: usize) -> usize {
+        i
+    }
 
     #[inline(always)]
     unsafe fn multiply_add(a: S::V, b: S::V, c: S::V) -> S::V {
@@ -108,6 +116,12 @@ pub(super) struct Pairs;
 
 impl<S: Simd> Multiply<S> for Pairs {
     const PRODUCTS: Products = Products::Bf16;
+    const WEIGHT_STEP: usize = 1;
+
+    #[inline(always)]
+    fn weight(i: usize, ld: usize) -> usize {
+        i * ld
+    }
 
     #[inline(always)]
     unsafe fn multiply_add(a: S::V, b: S::V, c: S::V) -> S::V {
@@ -152,22 +166,5 @@ impl<S: Simd> Multiply<S> for Pairs {
             }
         }
         Channels { at: to, ld, count: from.count }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::Products;
-
-    #[test]
-    fn a_lane_holds_its_neighbours_rounded_to_nearest_even() {
-        assert_eq!(Products::F32.lane(1.5, 7.0), 1.5);
-        let halves = |bits: u32| (bits as u16, (bits >> 16) as u16);
-        // 1 + 2^-8 lies between 1 and 1 + 2^-7: to the even one, 1; 1 + 3 * 2^-8 up, to 1 + 2^-6.
-        let lane = Products::Bf16.lane(1.0 + 1.0 / 256.0, 1.0 + 3.0 / 256.0).to_bits();
-        assert_eq!(halves(lane), (0x3f80, 0x3f82));
-        let (first, second) = halves(Products::Bf16.lane(f32::NAN, f32::NEG_INFINITY).to_bits());
-        assert!(half::bf16::from_bits(first).is_nan());
-        assert_eq!(half::bf16::from_bits(second), half::bf16::NEG_INFINITY);
     }
 }

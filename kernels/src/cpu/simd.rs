@@ -177,10 +177,10 @@ pub(super) unsafe fn launch<K: Kernel>(isa: Isa, kernel: &K) -> K::Out {
     match isa {
         // SAFETY: the caller vouches for `isa` and for the kernel's contract.
         #[cfg(target_arch = "x86_64")]
-        Isa::Avx512Bf16 if K::PAIRS => unsafe { super::simd_x86::run_avx512_bf16(kernel) },
-        // SAFETY: as above; the other instruction set has this one.
+        Isa::AmxBf16 | Isa::Avx512Bf16 if K::PAIRS => unsafe { super::simd_x86::run_avx512_bf16(kernel) },
+        // SAFETY: as above; the other instruction sets have this one.
         #[cfg(target_arch = "x86_64")]
-        Isa::Avx512Bf16 | Isa::Avx512 => unsafe { super::simd_x86::run_avx512(kernel) },
+        Isa::AmxBf16 | Isa::Avx512Bf16 | Isa::Avx512 => unsafe { super::simd_x86::run_avx512(kernel) },
         // SAFETY: as above.
         #[cfg(target_arch = "x86_64")]
         Isa::Avx2 => unsafe { super::simd_x86::run_avx2(kernel) },

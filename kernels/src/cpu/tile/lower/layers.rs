@@ -154,7 +154,7 @@ impl Lowering<'_> {
             return known;
         }
         let view = self.view(weights.buffer);
-        let len = panel_len(products.lanes(contraction), outputs).next_multiple_of(16);
+        let len = panel_len(products, contraction, outputs).next_multiple_of(16);
         let elements = view.elements;
         self.out.packs.push(Pack { weights, products, view, at: self.out.packed, len, elements });
         self.out.packed += len * elements;
