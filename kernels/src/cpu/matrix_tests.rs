@@ -73,7 +73,7 @@ impl GemmCase {
         let mut scratch = AlignedVec::zeroed(gemm_scratch(products, c) + 1);
         *scratch.last_mut().unwrap() = CANARY;
         let (k, n) = if transposed { (o, c) } else { (c, o) };
-        pack_panels(products, &self.w, k, n, transposed, &mut panels);
+        pack_panels(isa, products, &self.w, k, n, transposed, &mut panels);
         let mut y = self.h.clone();
         for row in y.chunks_exact_mut(self.ldy) {
             row[self.rows..].fill(CANARY);

@@ -203,8 +203,8 @@ fn run_launch(
     let pack_one = |(p, own): (&raygrad_kernels::cpu::tile::Pack, &mut [f32])| {
         let mut p = p.clone();
         p.at = 0;
-        // SAFETY: weights are not written during a launch that reads them as weights.
-        unsafe { pack(&p, memory, own) };
+        // SAFETY: weights are not written during a launch that reads them as weights; `isa` was detected.
+        unsafe { pack(&p, isa, memory, own) };
     };
     if tiles.packed > FLAT_TASK {
         packs.into_par_iter().for_each(pack_one)

@@ -34,8 +34,8 @@ pub struct Chunk<'a> {
 /// Packs one set of weights into `packed`.
 ///
 /// # Safety
-/// The addresses of `memory` are those of the program's buffers, and nobody writes the weights meanwhile.
-pub unsafe fn pack(pack: &Pack, memory: Memory, packed: &mut [f32]) {
+/// The addresses of `memory` are those of the program's buffers, nobody writes the weights meanwhile, and `isa` is supported.
+pub unsafe fn pack(pack: &Pack, isa: Isa, memory: Memory, packed: &mut [f32]) {
     let w = &pack.weights;
     let lanes = w.rows * w.columns;
     let base = memory.buffers[w.buffer.0 as usize].wrapping_add(w.first * pack.elements);
@@ -44,11 +44,11 @@ pub unsafe fn pack(pack: &Pack, memory: Memory, packed: &mut [f32]) {
         if pack.elements == 1 {
             // SAFETY: the buffer holds the weights' channels one after the other, being of one element.
             let matrix = unsafe { std::slice::from_raw_parts(base, lanes) };
-            pack_panels(pack.products, matrix, w.rows, w.columns, w.transposed, panels);
+            pack_panels(isa, pack.products, matrix, w.rows, w.columns, w.transposed, panels);
         } else {
             // SAFETY: channel c of element e lies at c * elements + e.
             let matrix: Vec<f32> = (0..lanes).map(|c| unsafe { *base.add(c * pack.elements + e) }).collect();
-            pack_panels(pack.products, &matrix, w.rows, w.columns, w.transposed, panels);
+            pack_panels(isa, pack.products, &matrix, w.rows, w.columns, w.transposed, panels);
         }
     }
 }
