@@ -139,30 +139,25 @@ pub(super) unsafe fn chains(steps: usize) -> f64 {
     (steps.max(1) * 4 * TILE * TILE * 2 * TILE * 2) as f64
 }
 
-/// Lines that start `ld` lanes apart.
-#[derive(Clone, Copy)]
-pub(super) struct Lines<T> {
-    pub at: T,
-    pub ld: usize,
-}
-
-/// `c = a b`, or `c += a b`: `tiles` times [`TILE`] pairs along the sum, `WIDE` columns or half as many.
+/// `c = sum of terms a b`, or `c +=` it: `tiles` times [`TILE`] pairs along the sum, [`COLUMNS`] columns if `WIDE` or half as
+/// many. Terms are added one after the other.
 ///
 /// # Safety
-/// [`Tiles`] are configured for the lines of `a` and `c`; `a` has `tiles * TILE` lanes a line, `b` as many lines of the
-/// columns, and `tiles` is not 0.
+/// [`Tiles`] are configured for the lines of `a` and `c`. In every term `a` has `tiles * TILE` lanes a line, `lda` lanes apart,
+/// and `b` as many lines of the columns, `ldb` lanes apart. Neither `tiles` nor `terms` is empty.
 #[inline(always)]
-pub(super) unsafe fn product<const WIDE: bool>(
-    a: Lines<*const f32>,
-    b: Lines<*const f32>,
+unsafe fn product<const WIDE: bool>(
+    terms: &[Term],
+    [lda, ldb]: [usize; 2],
     tiles: usize,
-    c: Lines<*mut f32>,
+    c: *mut f32,
+    ldc: usize,
     add: bool,
 ) {
     macro_rules! product {
         ($([$second:literal])?) => {
             asm!(
-                "test {add:e}, {add:e}",
+                "test {a:e}, {a:e}",
                 "jz 2f",
                 "tileloadd tmm0, [{c} + {ldc}]",
                 $(concat!($second, "tileloadd tmm1, [{c} + {ldc} + 64]"),)?
@@ -171,6 +166,10 @@ pub(super) unsafe fn product<const WIDE: bool>(
                 "tilezero tmm0",
                 $(concat!($second, "tilezero tmm1"),)?
                 "3:",
+                "mov {a}, [{terms}]",
+                "mov {b}, [{terms} + 8]",
+                "mov {k}, {tiles}",
+                "4:",
                 "tileloadd tmm2, [{a} + {lda}]",
                 "tileloadd tmm3, [{b} + {ldb}]",
                 "tdpbf16ps tmm0, tmm2, tmm3",
@@ -178,27 +177,40 @@ pub(super) unsafe fn product<const WIDE: bool>(
                 $(concat!($second, "tdpbf16ps tmm1, tmm2, tmm3"),)?
                 "add {a}, 64",
                 "add {b}, {step}",
-                "dec {tiles}",
-                "jnz 3b",
+                "dec {k}",
+                "jnz 4b",
+                "add {terms}, 16",
+                "cmp {terms}, {end}",
+                "jne 3b",
                 "tilestored [{c} + {ldc}], tmm0",
                 $(concat!($second, "tilestored [{c} + {ldc} + 64], tmm1"),)?
-                a = inout(reg) a.at => _,
-                lda = in(reg) 4 * a.ld,
-                b = inout(reg) b.at => _,
-                ldb = in(reg) 4 * b.ld,
-                step = in(reg) 4 * TILE * b.ld,
-                tiles = inout(reg) tiles => _,
-                c = in(reg) c.at,
-                ldc = in(reg) 4 * c.ld,
-                add = in(reg) u32::from(add),
+                terms = inout(reg) terms.as_ptr() => _,
+                end = in(reg) terms.as_ptr_range().end,
+                a = inout(reg) usize::from(add) => _,
+                b = out(reg) _,
+                k = out(reg) _,
+                tiles = in(reg) tiles,
+                lda = in(reg) 4 * lda,
+                ldb = in(reg) 4 * ldb,
+                step = in(reg) 4 * TILE * ldb,
+                c = in(reg) c,
+                ldc = in(reg) 4 * ldc,
                 out("tmm0") _, out("tmm1") _, out("tmm2") _, out("tmm3") _,
                 options(nostack),
             )
         };
     }
-    debug_assert!(tiles > 0);
+    debug_assert!(tiles > 0 && !terms.is_empty());
     // SAFETY: reads and writes what the caller vouches for.
     unsafe { if WIDE { product!([""]) } else { product!() } }
+}
+
+/// Factors of a product: lines of both.
+#[repr(C)]
+#[derive(Clone, Copy)]
+struct Term {
+    a: *const f32,
+    b: *const f32,
 }
 
 /// A product of [`Products::Bf16`] in tiles.
@@ -271,12 +283,11 @@ impl Tiled<'_, Gemm> {
             while output < args.outputs {
                 let count = TILE.min(args.outputs - output);
                 tiles.configure(count);
-                let weights = Lines { at: args.panels.add(output * ld), ld };
+                let weights = args.panels.add(output * ld);
                 let mut first = 0;
                 while first < width {
-                    let x = Lines { at: x.at.add(first), ld: width };
-                    let to = Lines { at: sums.0.as_mut_ptr(), ld: COLUMNS };
-                    product::<true>(weights, x, ld / TILE, to, false);
+                    let term = Term { a: weights, b: x.at.add(first) };
+                    product::<true>(&[term], [ld, width], ld / TILE, sums.0.as_mut_ptr(), COLUMNS, false);
                     for i in 0..count {
                         let bias = if args.bias.is_null() { 0.0 } else { *args.bias.add(output + i) };
                         let mut acc = [[S::splat(bias); 2]];
@@ -328,13 +339,13 @@ pub(super) unsafe fn blocks<S: Simd>(
             let count = TILE.min(others.count - channel);
             prefetch(channel + count);
             tiles.configure(count);
-            let a = Lines { at: others.at.add(channel * others.ld), ld: others.ld };
-            let b = Lines { at: panel.cast_const(), ld: outer::PANEL };
-            let g = Lines { at: g.add(channel * outer::PANEL), ld: outer::PANEL };
+            let term = Term { a: others.at.add(channel * others.ld), b: panel };
+            let g = g.add(channel * outer::PANEL);
+            let ld = [others.ld, outer::PANEL];
             if columns > TILE {
-                product::<true>(a, b, whole / TILE, g, true);
+                product::<true>(&[term], ld, whole / TILE, g, outer::PANEL, true);
             } else {
-                product::<false>(a, b, whole / TILE, g, true);
+                product::<false>(&[term], ld, whole / TILE, g, outer::PANEL, true);
             }
             channel += count;
         }
