@@ -7,7 +7,7 @@
 //!
 //! Tile registers belong to this module alone, since no compiler uses them unasked. Hence their configuration may last from one
 //! `asm!` to the next; what they hold does not need to.
-use super::gemm::Gemm;
+use super::gemm::{Gemm, MOST_ROWS};
 use super::outer::{self, Outer};
 use super::products::{Channels, Multiply, Pairs};
 use super::simd::{Kernel, Simd};
@@ -18,11 +18,9 @@ use std::arch::x86_64::__cpuid_count;
 use std::sync::OnceLock;
 
 /// Lines of a tile, and lanes of a line.
-pub(super) const TILE: usize = 16;
+const TILE: usize = 16;
 /// Columns of a block: two tiles.
 const COLUMNS: usize = 2 * TILE;
-/// Blocks of rows for which a product reads its weights once: the operand of 64 rows fits into the L1 cache.
-pub(super) const ROW_BLOCKS: usize = 2;
 
 /// Whether the CPU has the instructions and the operating system lets this process use them. Asks it, the first time.
 pub(super) fn allowed() -> bool {
@@ -51,7 +49,7 @@ fn ask() -> bool {
 }
 
 /// Configured tile registers; released when dropped, so that idle threads have no tiles to save.
-pub(super) struct Tiles {
+struct Tiles {
     lines: usize,
 }
 
@@ -69,7 +67,7 @@ impl Tiles {
     /// # Safety
     /// [`allowed`].
     #[inline(always)]
-    pub(super) unsafe fn new() -> Tiles {
+    unsafe fn new() -> Tiles {
         let mut tiles = Tiles { lines: 0 };
         // SAFETY: forwarded contract.
         unsafe { tiles.configure(TILE) };
@@ -81,7 +79,7 @@ impl Tiles {
     /// # Safety
     /// [`allowed`].
     #[inline(always)]
-    pub(super) unsafe fn configure(&mut self, lines: usize) {
+    unsafe fn configure(&mut self, lines: usize) {
         if lines == self.lines {
             return;
         }
@@ -139,25 +137,30 @@ pub(super) unsafe fn chains(steps: usize) -> f64 {
     (steps.max(1) * 4 * TILE * TILE * 2 * TILE * 2) as f64
 }
 
-/// `c = sum of terms a b`, or `c +=` it: `tiles` times [`TILE`] pairs along the sum, [`COLUMNS`] columns if `WIDE` or half as
-/// many. Terms are added one after the other.
+/// Lines that start `ld` lanes apart.
+#[derive(Clone, Copy)]
+struct Lines<T> {
+    at: T,
+    ld: usize,
+}
+
+/// `c = a b`, or `c += a b`: `tiles` times [`TILE`] pairs along the sum, `WIDE` columns or half as many.
 ///
 /// # Safety
-/// [`Tiles`] are configured for the lines of `a` and `c`. In every term `a` has `tiles * TILE` lanes a line, `lda` lanes apart,
-/// and `b` as many lines of the columns, `ldb` lanes apart. Neither `tiles` nor `terms` is empty.
+/// [`Tiles`] are configured for the lines of `a` and `c`; `a` has `tiles * TILE` lanes a line, `b` as many lines of the
+/// columns, and `tiles` is not 0.
 #[inline(always)]
 unsafe fn product<const WIDE: bool>(
-    terms: &[Term],
-    [lda, ldb]: [usize; 2],
+    a: Lines<*const f32>,
+    b: Lines<*const f32>,
     tiles: usize,
-    c: *mut f32,
-    ldc: usize,
+    c: Lines<*mut f32>,
     add: bool,
 ) {
     macro_rules! product {
         ($([$second:literal])?) => {
             asm!(
-                "test {a:e}, {a:e}",
+                "test {add:e}, {add:e}",
                 "jz 2f",
                 "tileloadd tmm0, [{c} + {ldc}]",
                 $(concat!($second, "tileloadd tmm1, [{c} + {ldc} + 64]"),)?
@@ -166,10 +169,6 @@ unsafe fn product<const WIDE: bool>(
                 "tilezero tmm0",
                 $(concat!($second, "tilezero tmm1"),)?
                 "3:",
-                "mov {a}, [{terms}]",
-                "mov {b}, [{terms} + 8]",
-                "mov {k}, {tiles}",
-                "4:",
                 "tileloadd tmm2, [{a} + {lda}]",
                 "tileloadd tmm3, [{b} + {ldb}]",
                 "tdpbf16ps tmm0, tmm2, tmm3",
@@ -177,40 +176,27 @@ unsafe fn product<const WIDE: bool>(
                 $(concat!($second, "tdpbf16ps tmm1, tmm2, tmm3"),)?
                 "add {a}, 64",
                 "add {b}, {step}",
-                "dec {k}",
-                "jnz 4b",
-                "add {terms}, 16",
-                "cmp {terms}, {end}",
-                "jne 3b",
+                "dec {tiles}",
+                "jnz 3b",
                 "tilestored [{c} + {ldc}], tmm0",
                 $(concat!($second, "tilestored [{c} + {ldc} + 64], tmm1"),)?
-                terms = inout(reg) terms.as_ptr() => _,
-                end = in(reg) terms.as_ptr_range().end,
-                a = inout(reg) usize::from(add) => _,
-                b = out(reg) _,
-                k = out(reg) _,
-                tiles = in(reg) tiles,
-                lda = in(reg) 4 * lda,
-                ldb = in(reg) 4 * ldb,
-                step = in(reg) 4 * TILE * ldb,
-                c = in(reg) c,
-                ldc = in(reg) 4 * ldc,
+                a = inout(reg) a.at => _,
+                lda = in(reg) 4 * a.ld,
+                b = inout(reg) b.at => _,
+                ldb = in(reg) 4 * b.ld,
+                step = in(reg) 4 * TILE * b.ld,
+                tiles = inout(reg) tiles => _,
+                c = in(reg) c.at,
+                ldc = in(reg) 4 * c.ld,
+                add = in(reg) u32::from(add),
                 out("tmm0") _, out("tmm1") _, out("tmm2") _, out("tmm3") _,
                 options(nostack),
             )
         };
     }
-    debug_assert!(tiles > 0 && !terms.is_empty());
+    debug_assert!(tiles > 0);
     // SAFETY: reads and writes what the caller vouches for.
     unsafe { if WIDE { product!([""]) } else { product!() } }
-}
-
-/// Factors of a product: lines of both.
-#[repr(C)]
-#[derive(Clone, Copy)]
-struct Term {
-    a: *const f32,
-    b: *const f32,
 }
 
 /// A product of [`Products::Bf16`] in tiles.
@@ -251,12 +237,12 @@ impl Kernel for Tiled<'_, Gemm> {
             let mut tiles = Tiles::new();
             let mut row = 0;
             while row < rows {
-                if rows - row >= ROW_BLOCKS * ROW_BLOCK {
-                    self.rows::<S, { 2 * ROW_BLOCKS }>(row, &mut tiles);
+                if rows - row >= MOST_ROWS {
+                    self.rows::<S, { MOST_ROWS / TILE }>(row, &mut tiles);
                 } else {
-                    self.rows::<S, 2>(row, &mut tiles);
+                    self.rows::<S, { ROW_BLOCK / TILE }>(row, &mut tiles);
                 }
-                row += ROW_BLOCKS * ROW_BLOCK;
+                row += MOST_ROWS;
             }
         }
     }
@@ -283,11 +269,11 @@ impl Tiled<'_, Gemm> {
             while output < args.outputs {
                 let count = TILE.min(args.outputs - output);
                 tiles.configure(count);
-                let weights = args.panels.add(output * ld);
-                let mut first = 0;
-                while first < width {
-                    let term = Term { a: weights, b: x.at.add(first) };
-                    product::<true>(&[term], [ld, width], ld / TILE, sums.0.as_mut_ptr(), COLUMNS, false);
+                let weights = Lines { at: args.panels.add(output * ld), ld };
+                for first in (0..width).step_by(COLUMNS) {
+                    let x = Lines { at: x.at.add(first), ld: width };
+                    let to = Lines { at: sums.0.as_mut_ptr(), ld: COLUMNS };
+                    product::<true>(weights, x, ld / TILE, to, false);
                     for i in 0..count {
                         let bias = if args.bias.is_null() { 0.0 } else { *args.bias.add(output + i) };
                         let mut acc = [[S::splat(bias); 2]];
@@ -296,7 +282,6 @@ impl Tiled<'_, Gemm> {
                         }
                         args.finish::<S, 1, 2>(&mut acc, output + i, row + first);
                     }
-                    first += COLUMNS;
                 }
                 output += count;
             }
@@ -313,13 +298,7 @@ struct Sums([f32; TILE * COLUMNS]);
 /// # Safety
 /// As [`Outer::panels`]: `g` has a line for each of `others`, which have whole tiles of lanes, and the panel has room for them.
 #[inline(always)]
-pub(super) unsafe fn blocks<S: Simd>(
-    panel: *mut f32,
-    columns: usize,
-    others: Channels,
-    steps: usize,
-    g: *mut f32,
-) {
+pub(super) unsafe fn blocks<S: Simd>(panel: *mut f32, columns: usize, others: Channels, steps: usize, g: *mut f32) {
     let prefetch = |channel: usize| {
         for i in channel..(channel + TILE).min(others.count) {
             for column in [0, TILE] {
@@ -339,13 +318,13 @@ pub(super) unsafe fn blocks<S: Simd>(
             let count = TILE.min(others.count - channel);
             prefetch(channel + count);
             tiles.configure(count);
-            let term = Term { a: others.at.add(channel * others.ld), b: panel };
-            let g = g.add(channel * outer::PANEL);
-            let ld = [others.ld, outer::PANEL];
+            let a = Lines { at: others.at.add(channel * others.ld), ld: others.ld };
+            let b = Lines { at: panel.cast_const(), ld: outer::PANEL };
+            let g = Lines { at: g.add(channel * outer::PANEL), ld: outer::PANEL };
             if columns > TILE {
-                product::<true>(&[term], ld, whole / TILE, g, outer::PANEL, true);
+                product::<true>(a, b, whole / TILE, g, true);
             } else {
-                product::<false>(&[term], ld, whole / TILE, g, outer::PANEL, true);
+                product::<false>(a, b, whole / TILE, g, true);
             }
             channel += count;
         }

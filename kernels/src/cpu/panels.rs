@@ -24,15 +24,7 @@ pub fn panel_len(products: Products, contraction: usize, outputs: usize) -> usiz
 ///
 /// # Panics
 /// If `w` or `out` (of [`panel_len`] lanes) is too short, or the machine lacks the instruction set.
-pub fn pack_panels(
-    isa: Isa,
-    products: Products,
-    w: &[f32],
-    k: usize,
-    n: usize,
-    transposed: bool,
-    out: &mut [f32],
-) {
+pub fn pack_panels(isa: Isa, products: Products, w: &[f32], k: usize, n: usize, transposed: bool, out: &mut [f32]) {
     let w = &w[..k * n];
     let (contraction, outputs) = if transposed { (n, k) } else { (k, n) };
     let out = &mut out[..panel_len(products, contraction, outputs)];
