@@ -293,12 +293,12 @@ impl Tiled<'_, Gemm> {
 #[repr(align(64))]
 struct Sums([f32; TILE * COLUMNS]);
 
-/// All sums of a panel: the first `columns` of its [`outer::PANEL`] by all of `others`, over `steps` lines.
+/// All sums of a panel: the first `columns` of its [`outer::PANEL`] by all of `others`, over `steps` lines, whole tiles.
 ///
 /// # Safety
-/// As [`Outer::panels`]: `g` has a line for each of `others`, which have whole tiles of lanes, and the panel has room for them.
+/// As [`Outer::panels`]: `g` has a line for each of `others`, which have `steps` lanes, and the panel has as many lines.
 #[inline(always)]
-pub(super) unsafe fn blocks<S: Simd>(panel: *mut f32, columns: usize, others: Channels, steps: usize, g: *mut f32) {
+pub(super) unsafe fn blocks<S: Simd>(panel: *const f32, columns: usize, others: Channels, steps: usize, g: *mut f32) {
     let prefetch = |channel: usize| {
         for i in channel..(channel + TILE).min(others.count) {
             for column in [0, TILE] {
@@ -307,10 +307,8 @@ pub(super) unsafe fn blocks<S: Simd>(panel: *mut f32, columns: usize, others: Ch
             }
         }
     };
-    // SAFETY: the panel has room for whole tiles of lines; `count` lines are left of `others` and of `g`.
+    // SAFETY: `count` lines are left of `others` and of `g`.
     unsafe {
-        let whole = steps.next_multiple_of(TILE);
-        std::ptr::write_bytes(panel.add(steps * outer::PANEL), 0, (whole - steps) * outer::PANEL);
         let mut tiles = Tiles::new();
         prefetch(0);
         let mut channel = 0;
@@ -319,12 +317,12 @@ pub(super) unsafe fn blocks<S: Simd>(panel: *mut f32, columns: usize, others: Ch
             prefetch(channel + count);
             tiles.configure(count);
             let a = Lines { at: others.at.add(channel * others.ld), ld: others.ld };
-            let b = Lines { at: panel.cast_const(), ld: outer::PANEL };
+            let b = Lines { at: panel, ld: outer::PANEL };
             let g = Lines { at: g.add(channel * outer::PANEL), ld: outer::PANEL };
             if columns > TILE {
-                product::<true>(a, b, whole / TILE, g, true);
+                product::<true>(a, b, steps / TILE, g, true);
             } else {
-                product::<false>(a, b, whole / TILE, g, true);
+                product::<false>(a, b, steps / TILE, g, true);
             }
             channel += count;
         }

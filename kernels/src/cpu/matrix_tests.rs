@@ -181,7 +181,11 @@ fn fused_gemm_is_bitwise_equal_across_instruction_sets() {
 /// Runs `outer` twice on the same accumulator, the second time with `x` in two parts, and adds the result to ones.
 fn outer_twice((isa, products): (Isa, Products), k: usize, n: usize, rows: usize) -> Vec<f32> {
     let ld = row_stride(rows);
-    let (x, d) = (noise(k * ld, 5), noise(n * ld, 6));
+    let (mut x, mut d) = (noise(k * ld, 5), noise(n * ld, 6));
+    // Rows that do not count hold anything.
+    for channel in x.chunks_exact_mut(ld).chain(d.chunks_exact_mut(ld)) {
+        channel[rows..].fill(f32::NAN);
+    }
     let mut g = AlignedVec::zeroed(outer_len(k, n) + 1);
     let mut scratch = AlignedVec::zeroed(outer_scratch(products, k, n, rows) + 1);
     *scratch.last_mut().unwrap() = CANARY;

@@ -167,7 +167,10 @@ impl Outer {
         let mut row = 0;
         while row < self.rows {
             let rows = (PANEL_ROWS * P::PRODUCTS.values()).min(self.rows - row);
-            let steps = P::PRODUCTS.lanes(rows);
+            let mut steps = P::PRODUCTS.lanes(rows);
+            if IN_TILES {
+                steps = steps.next_multiple_of(16);
+            }
             // SAFETY: `rows` rows from `row` on of every channel, in whole blocks, and the scratch has room for them.
             let (others, strip) = unsafe {
                 let others = Channels { at: others.at.add(row), ..others };

@@ -65,7 +65,7 @@ pub(super) trait Multiply<S: Simd> {
     unsafe fn over_channels<const NV: usize>(from: Channels, to: *mut f32) -> Channels;
 
     /// Channels as an operand whose sum runs over `rows` rows. They are written to `to`, of [`over_rows_len`] lanes,
-    /// unless they can stay where they are; what follows the last row is finite garbage.
+    /// unless they can stay where they are, with zeros after the last row up to a multiple of 16 lanes.
     unsafe fn over_rows(from: Channels, rows: usize, to: *mut f32) -> Channels;
 }
 
@@ -164,6 +164,10 @@ impl<S: Simd> Multiply<S> for Pairs {
                 }
                 row += 2 * S::LANES;
             }
+            // Rows that do not count hold anything.
+            let steps = Products::Bf16.lanes(rows);
+            // SAFETY: the stride is a multiple of 16 lanes, and these follow those of the rows.
+            unsafe { to.add(channel * ld + steps).write_bytes(0, steps.next_multiple_of(16) - steps) };
         }
         Channels { at: to, ld, count: from.count }
     }
