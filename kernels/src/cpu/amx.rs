@@ -2,8 +2,8 @@
 //!
 //! A tile register holds up to 16 lines of 16 lanes. One instruction multiplies `[line][pair]` by `[pair][column]`, 16 pairs
 //! at a time, and adds to `[line][column]`, sixteen times what a vector instruction does. Blocks are one tile high and two
-//! wide, with four registers in use: loads and products rename their registers, and where the other hyperthread of a core is
-//! busy, so few are left that larger blocks wait for each other (docs/rejected.md).
+//! wide, with four registers in use: loads and products rename their registers, and beside a neighbour on the same core so few
+//! seem to be left that larger blocks wait for each other (docs/rejected.md).
 //!
 //! Tile registers belong to this module alone, since no compiler uses them unasked. Hence their configuration may last from one
 //! `asm!` to the next; what they hold does not need to.
