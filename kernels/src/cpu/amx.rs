@@ -144,7 +144,7 @@ struct Lines<T> {
     ld: usize,
 }
 
-/// `c = a b`, or `c += a b`: `tiles` times [`TILE`] pairs along the sum, `WIDE` columns or half as many.
+/// `c = a b`, or `c += a b`: `tiles` times [`TILE`] pairs along the sum, [`COLUMNS`] columns if `WIDE` or half as many.
 ///
 /// # Safety
 /// [`Tiles`] are configured for the lines of `a` and `c`; `a` has `tiles * TILE` lanes a line, `b` as many lines of the
@@ -222,7 +222,7 @@ impl Kernel for Tiled<'_, Outer> {
     #[inline(always)]
     unsafe fn run<S: Simd>(&self) {
         // SAFETY: forwarded contract.
-        unsafe { self.0.panels::<S, Pairs, 0, 2, 1, true>() }
+        unsafe { self.0.panels::<S, Pairs, 8, 2, 1, true>() }
     }
 }
 
@@ -265,8 +265,7 @@ impl Tiled<'_, Gemm> {
             let x = <Pairs as Multiply<S>>::over_channels::<NV>(x, args.scratch);
             std::slice::from_raw_parts_mut(args.scratch.add(x.count * width), (ld - x.count) * width).fill(0.0);
             let mut sums = Sums([0.0; TILE * COLUMNS]);
-            let mut output = 0;
-            while output < args.outputs {
+            for output in (0..args.outputs).step_by(TILE) {
                 let count = TILE.min(args.outputs - output);
                 tiles.configure(count);
                 let weights = Lines { at: args.panels.add(output * ld), ld };
@@ -283,7 +282,6 @@ impl Tiled<'_, Gemm> {
                         args.finish::<S, 1, 2>(&mut acc, output + i, row + first);
                     }
                 }
-                output += count;
             }
         }
     }
@@ -311,8 +309,7 @@ pub(super) unsafe fn blocks<S: Simd>(panel: *const f32, columns: usize, others: 
     unsafe {
         let mut tiles = Tiles::new();
         prefetch(0);
-        let mut channel = 0;
-        while channel < others.count {
+        for channel in (0..others.count).step_by(TILE) {
             let count = TILE.min(others.count - channel);
             prefetch(channel + count);
             tiles.configure(count);
@@ -324,7 +321,6 @@ pub(super) unsafe fn blocks<S: Simd>(panel: *const f32, columns: usize, others: 
             } else {
                 product::<false>(a, b, steps / TILE, g, true);
             }
-            channel += count;
         }
     }
 }

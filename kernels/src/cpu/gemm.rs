@@ -161,7 +161,8 @@ impl Gemm {
         row: usize,
     ) {
         // SAFETY: every access is step `< count` of `x`, or output `output + i` of `bias`, `y` and `h`, at
-        // vector `j` of the block's rows: inside by the contract. Weights stay in the panel because `output % PANEL + MR <= PANEL`.
+        // vector `j` of the block's rows: inside by the contract. Weights stay in the panel because
+        // `output % PANEL + MR <= PANEL`.
         unsafe {
             let zero = S::splat(0.0);
             let mut acc = [[zero; NV]; MR];
@@ -204,8 +205,8 @@ impl Gemm {
         }
     }
 
-    /// Applies the old `y` and the epilogue to the accumulators of a block, and stores them. One loop per case, because the compiler
-    /// keeps accumulators in registers only in loops simple enough to be unrolled.
+    /// Applies the old `y` and the epilogue to the accumulators of a block, and stores them. One loop per case, because the
+    /// compiler keeps accumulators in registers only in loops simple enough to be unrolled.
     ///
     /// # Safety
     /// As [`gemm`]; the block lies inside `y`.

@@ -35,8 +35,8 @@ impl Isa {
         matches!(self, Isa::AmxBf16 | Isa::Avx512Bf16)
     }
 
-    /// Whether this machine can run kernels compiled for this instruction set. The first call asks the kernel for tiles
-    /// where the CPU has them, for the whole process.
+    /// Whether this machine can run kernels compiled for this instruction set. The first call asks the operating
+    /// system for tiles where the CPU has them, for the whole process.
     pub fn supported(self) -> bool {
         match self {
             #[cfg(target_arch = "x86_64")]

@@ -2,8 +2,8 @@
 //!
 //! A tile value is **channel-major**, `[channel][row]`, in 32-bit lanes (`f32`, or `u32` bits). Neighbouring channels
 //! are `ld` lanes apart. Rows are the samples of a batch, so every kernel vectorises over rows; only the sum over rows of
-//! [`mod@outer`] transposes an operand. The number of rows is padded to [`ROW_BLOCK`]; padded rows hold finite garbage,
-//! which the matrix kernels may read and write.
+//! [`mod@outer`] transposes an operand. The number of rows is padded to [`ROW_BLOCK`]; padded rows hold
+//! anything, NaN too: kernels that work row by row may read and write them, sums over rows leave them out.
 //!
 //! Every kernel is written once, generic over `simd::Simd`, and `simd::launch` instantiates it for each
 //! instruction set. Which one runs is an explicit argument ([`Isa`]), so that tests cover all of them on one machine.

@@ -169,6 +169,7 @@ impl Outer {
             let rows = (PANEL_ROWS * P::PRODUCTS.values()).min(self.rows - row);
             let mut steps = P::PRODUCTS.lanes(rows);
             if IN_TILES {
+                // Zeros fill the last tile.
                 steps = steps.next_multiple_of(16);
             }
             // SAFETY: `rows` rows from `row` on of every channel, in whole blocks, and the scratch has room for them.
@@ -186,21 +187,10 @@ impl Outer {
                     let from = Channels { at: vectors.at.add(channel * vectors.ld + row), count, ..vectors };
                     transpose::<S>(P::over_rows(from, rows, strip), steps, panel);
                     let g = self.g.add(first + channel * height);
-                    #[cfg(target_arch = "x86_64")]
-                    if IN_TILES {
-                        super::amx::blocks::<S>(panel, count, others, steps, g);
-                        channel += PANEL;
-                        continue;
-                    }
-                    let mut column = 0;
-                    while column < count {
-                        let (panel, g) = (panel.add(column), g.add(column));
-                        if count - column > HALF * S::LANES {
-                            blocks::<S, P, MR, NV>(panel, others, steps, g);
-                        } else {
-                            blocks::<S, P, MR, HALF>(panel, others, steps, g);
-                        }
-                        column += NV * S::LANES;
+                    match IN_TILES {
+                        #[cfg(target_arch = "x86_64")]
+                        true => super::amx::blocks::<S>(panel, count, others, steps, g),
+                        _ => columns::<S, P, MR, NV, HALF>(panel, count, others, steps, g),
                     }
                 }
                 channel += PANEL;
@@ -229,6 +219,31 @@ unsafe fn transpose<S: Simd>(from: Channels, rows: usize, panel: *mut f32) {
             row += STEPS;
         }
         channel += S::LANES;
+    }
+}
+
+/// All sums of a panel: the first `count` of its columns by all of `others`.
+///
+/// # Safety
+/// As [`Outer::panels`]: `g` has a line of the panel for each of `others`.
+#[inline(always)]
+unsafe fn columns<S: Simd, P: Multiply<S>, const MR: usize, const NV: usize, const HALF: usize>(
+    panel: *const f32,
+    count: usize,
+    others: Channels,
+    steps: usize,
+    g: *mut f32,
+) {
+    for column in (0..count).step_by(NV * S::LANES) {
+        // SAFETY: `NV` vectors of the panel and of each line, or the `HALF` that hold the last columns.
+        unsafe {
+            let (panel, g) = (panel.add(column), g.add(column));
+            if count - column > HALF * S::LANES {
+                blocks::<S, P, MR, NV>(panel, others, steps, g);
+            } else {
+                blocks::<S, P, MR, HALF>(panel, others, steps, g);
+            }
+        }
     }
 }
 

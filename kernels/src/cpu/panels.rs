@@ -31,8 +31,8 @@ pub fn pack_panels(isa: Isa, products: Products, w: &[f32], k: usize, n: usize, 
     if w.is_empty() {
         return;
     }
-    match (products, transposed) {
-        (Products::F32, _) => {
+    match products {
+        Products::F32 => {
             for (panel, first) in out.chunks_exact_mut(PANEL * contraction).zip((0..outputs).step_by(PANEL)) {
                 let count = PANEL.min(outputs - first);
                 if count < PANEL {
@@ -50,7 +50,7 @@ pub fn pack_panels(isa: Isa, products: Products, w: &[f32], k: usize, n: usize, 
                 }
             }
         }
-        (Products::Bf16, _) => {
+        Products::Bf16 => {
             let pairs = PackPairs { w, contraction, outputs, transposed, out: out.as_mut_ptr() };
             assert!(isa.supported(), "{isa} is not supported by this machine");
             // SAFETY: the instruction set is there, and both slices have the lengths that the kernel wants.
@@ -111,9 +111,8 @@ impl PackPairs<'_> {
     unsafe fn columns<S: Simd>(&self) {
         let ld = Products::Bf16.weight_stride(self.contraction);
         let n = self.outputs;
-        // Channel `row` of 16 outputs from `first` on, of which `width` exist; zeros beyond the last one.
+        // Steps by outputs.
         let mut block = [[0.0f32; 16]; 16];
-        let from = block.each_ref().map(|line| line.as_ptr());
         for first in (0..n).step_by(S::LANES) {
             let width = S::LANES.min(n - first);
             for step in (0..ld).step_by(S::LANES) {
@@ -132,6 +131,7 @@ impl PackPairs<'_> {
                         S::store(line.as_mut_ptr(), S::pair(of(channel), of(channel + 1)));
                     }
                 }
+                let from = block.each_ref().map(|line| line.as_ptr());
                 for o in (0..width).step_by(4) {
                     let to = self.out.wrapping_add((first + o) * ld + step);
                     if width - o >= 4 {

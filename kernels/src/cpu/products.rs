@@ -1,7 +1,7 @@
 //! What the matrix kernels multiply: floats, or pairs of bfloat16 values whose products are summed in single precision.
 //!
-//! With [`Products::Bf16`] a lane holds two neighbours along the sum, the first one in its low half, and one instruction
-//! adds both products to a lane of the sum: twice the rate of multiply-adds where the CPU has it
+//! With [`Products::Bf16`] a lane holds two neighbours along the sum, the first one in its low half. Instructions multiply
+//! tiles of them ([`Isa::AmxBf16`](super::Isa), in [`super::amx`]) or add both products to a lane of the sum
 //! ([`Isa::Avx512Bf16`](super::Isa)). Elsewhere the same numbers are computed from the halves of a lane, slower than in
 //! single precision. Operands are rounded (to nearest, ties to even) where a kernel reads them; nothing is stored so.
 use super::ROW_BLOCK;
