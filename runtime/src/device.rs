@@ -28,13 +28,16 @@ pub struct Forms {
     pub half: Option<Half>,
     /// How many of the largest tiles not to use ([`raygrad_kernels::gpu::Limits::tiles`]); software has tiles of its own.
     pub tiles: u32,
+    /// Networks whose layers have at most this many outputs stay in a workgroup ([`Target::resident`]); 0: none do.
+    pub resident: usize,
 }
 
 #[cfg(feature = "gpu")]
 impl Forms {
     /// What suits an adapter: software has tiles of its own.
     fn of(adapter: &crate::Adapter) -> Forms {
-        Forms { half: None, tiles: if adapter.kind == crate::AdapterKind::Software { SOFTWARE_TILES } else { 0 } }
+        let software = adapter.kind == crate::AdapterKind::Software;
+        Forms { tiles: if software { SOFTWARE_TILES } else { 0 }, ..Forms::default() }
     }
 }
 
@@ -218,10 +221,8 @@ impl Device {
     pub fn target(&self) -> Target {
         match self {
             Device::Cpu { .. } => Target::cpu(),
-            #[cfg(feature = "wgpu")]
-            Device::Wgpu { .. } => Target::gpu(),
-            #[cfg(feature = "vulkan")]
-            Device::Vulkan { .. } => Target::gpu(),
+            #[cfg(feature = "gpu")]
+            _ => Target { resident: self.forms().resident, ..Target::gpu() },
         }
     }
 

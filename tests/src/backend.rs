@@ -55,6 +55,13 @@ pub fn software() -> Option<Device> {
     Some(vulkan()?.with_forms(forms))
 }
 
+/// The best adapter of each backend, where networks of at most so many outputs a layer stay in a workgroup.
+#[cfg(feature = "gpu")]
+pub fn resident(most: usize) -> Vec<Device> {
+    let forms = raygrad_runtime::Forms { resident: most, ..Default::default() };
+    gpus().into_iter().map(|d| d.with_forms(forms)).collect()
+}
+
 fn unless_none_is_expected(opened: Result<Device, DeviceError>) -> Option<Device> {
     match opened {
         Ok(device) => Some(device),

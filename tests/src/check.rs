@@ -125,7 +125,7 @@ pub fn check(devices: &[Device], step: &Step, bindings: &Bindings) -> Result<(),
     let bindings = round(bindings);
     let reference = expected(step, &bindings);
     agree("the simplified graph", &reference, &expected(&simplify(step), &bindings), 1e-9, || Some(vec![]))?;
-    for target in [Target::cpu(), Target::gpu()] {
+    for target in [Target::cpu(), Target::gpu(), Target { resident: 128, ..Target::gpu() }] {
         let noise = || Some(rounded(step, &bindings));
         agree(
             &format!("the plan for {:?}", target.kind),

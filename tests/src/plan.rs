@@ -79,7 +79,7 @@ fn replaced(region: &Region) -> Result<(), String> {
         let own = matches!(store, Store::Write { .. })
             && matches!(inst.op, RegionOp::Load(_))
             && inst.axes == region.domain
-            && (region.grain == Grain::Row || stays_in_its_channel(region, at));
+            && (region.grain != Grain::Lane || stays_in_its_channel(region, at));
         if !own {
             return Err(format!("instruction {at} reads b{} while it is replaced", read.0));
         }

@@ -58,6 +58,21 @@ pub fn depth_samples(sample: &Axis, jitter: &Tensor, near: &Tensor, far: &Tensor
 /// depths increasing), and the `length` of the ray's direction.
 #[track_caller]
 pub fn composite(color: &Tensor, density: &Tensor, depth: &Tensor, length: &Tensor, sample: &Axis) -> Composite {
+    composite_above(0.0, color, density, depth, length, sample)
+}
+
+/// The same for rays that end at the first sample that less than the share `least` of the light reaches: those behind it weigh
+/// nothing, and a GPU that follows a whole ray leaves them out. No channel of a colour between 0 and 1 changes by more than
+/// `least`, nor does the opacity.
+#[track_caller]
+pub fn composite_above(
+    least: f64,
+    color: &Tensor,
+    density: &Tensor,
+    depth: &Tensor,
+    length: &Tensor,
+    sample: &Axis,
+) -> Composite {
     for (what, t) in [("densities", density), ("depths", depth), ("lengths", length)] {
         if let Err(bad) = expect_width("composite", what, t, 1) {
             return Composite { color: bad.clone(), depth: bad.clone(), opacity: bad.clone(), weights: bad };
@@ -69,7 +84,13 @@ pub fn composite(color: &Tensor, density: &Tensor, depth: &Tensor, length: &Tens
     let alpha = 1.0 - (-&absorbed).exp();
     // What is absorbed in the last interval lies behind every sample.
     let before = last.select(&Tensor::scalar(0.0), &absorbed).cumsum(sample);
-    let weights = (-before).exp() * alpha;
+    let light = (-before).exp();
+    let mut weights = &light * alpha;
+    if least > 0.0 {
+        // How many samples before this one were already dark.
+        let dark = light.less_than(&Tensor::scalar(least)).to_f32().cumsum(sample);
+        weights = Tensor::scalar(0.0).less_than(&dark).select(&Tensor::scalar(0.0), &weights);
+    }
     let along = |t: &Tensor| (&weights * t).sum(&[sample]);
     Composite { color: along(color), depth: along(depth), opacity: weights.sum(&[sample]), weights }
 }

@@ -1,6 +1,7 @@
 //! Domains, free values, forced cuts and depths.
 
 use super::lines::{self, Copies};
+use super::resident::{After, Resident, after};
 use super::{Target, TargetKind};
 use crate::graph::{Axes, Axis, Tensor, topological};
 use crate::ops::Form;
@@ -42,6 +43,8 @@ pub(super) struct Info {
     pub free: bool,
     /// Whether one of its channels can be computed without the others, from inputs on.
     pub by_lane: bool,
+    /// What it was last computed from.
+    pub after: After,
     pub depth: usize,
     /// Operations to compute one element from inputs and what is surely stored.
     pub closure_flops: u64,
@@ -93,6 +96,7 @@ pub(super) struct Cuts {
     pub order: Vec<u64>,
     pub target: Target,
     copies: Copies,
+    resident: Resident,
     /// Depth before which no region over a domain of whole lines starts.
     starts: HashMap<Axes, usize>,
 }
@@ -100,14 +104,16 @@ pub(super) struct Cuts {
 impl Cuts {
     pub fn new(roots: &[Tensor], target: Target) -> Cuts {
         let (copies, starts) = (Copies::default(), HashMap::new());
-        let mut cuts = Cuts { nodes: HashMap::new(), order: vec![], target, copies, starts };
+        let resident = Resident::of(roots, target.resident);
+        let mut cuts = Cuts { nodes: HashMap::new(), order: vec![], target, copies, resident, starts };
         cuts.inspect_all(roots);
         let domains = lines::domains(&cuts);
         cuts.copies = lines::copies(&cuts, &domains);
         if !domains.is_empty() {
             cuts.inspect_all(roots);
-            domains.iter().for_each(|d| cuts.start_late(roots, d));
         }
+        let together: Vec<Axes> = domains.into_iter().chain(cuts.resident.domains()).collect();
+        together.iter().for_each(|d| cuts.start_late(roots, d));
         cuts.sink(roots);
         cuts
     }
@@ -200,6 +206,7 @@ impl Cuts {
             reduces,
             free: false,
             by_lane: false,
+            after: After::Neither,
             depth: 0,
             closure_flops: 0,
         };
@@ -210,7 +217,8 @@ impl Cuts {
                 info.operands[i] = copy.clone();
             }
         }
-        info.grain = self.grain(&info);
+        info.after = after(self, &info);
+        info.grain = self.resident.grain(&info).unwrap_or_else(|| self.grain(&info));
         info.by_lane = match info.form {
             Form::Input | Form::Const(_) | Form::Index { .. } | Form::Take { .. } => true,
             Form::Pointwise(_) | Form::Pick(_) | Form::Identity => info.operands.iter().all(|o| self.get(o).by_lane),

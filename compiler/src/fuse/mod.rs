@@ -10,13 +10,15 @@
 //!
 //! What a region needs from an earlier region of the same domain is either stored or computed again: the fewest channels
 //! are stored that spare it from computing narrow expensive values again; wide ones are recomputed (see
-//! [`Target::store_channels`]). On a GPU, parts of a stored concatenation are read back from it (see [`reread`]).
+//! [`Target::store_channels`]). On a GPU, parts of a stored concatenation are read back from it (see [`reread`]), and layers of
+//! narrow networks need no cut (see [`resident`]).
 
 mod build;
 mod cuts;
 mod lines;
 mod merge;
 mod reread;
+mod resident;
 mod store;
 
 pub use build::{Fused, Origin, fuse};
@@ -42,13 +44,15 @@ pub struct Target {
     pub line_rows: usize,
     /// ... at least this many positions of the outer axes, so that there are still tiles for every thread.
     pub lines: usize,
+    /// GPU: networks whose layers have at most this many outputs are resident; 0: none are.
+    pub resident: usize,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TargetKind {
     /// Resident tiles: a region holds any number of layers.
     Cpu,
-    /// Layered: a region holds the layers of one depth and their pointwise epilogues.
+    /// Layered: a region holds the layers of one depth and their pointwise epilogues; or resident, see [`Target::resident`].
     Gpu,
 }
 
@@ -64,6 +68,7 @@ impl Target {
             tile_rows: 192,
             line_rows: 1024,
             lines: 16,
+            resident: 0,
         }
     }
     pub fn gpu() -> Target {
@@ -77,6 +82,7 @@ impl Target {
             tile_rows: 0,
             line_rows: 0,
             lines: 0,
+            resident: 0,
         }
     }
 }

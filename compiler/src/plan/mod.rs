@@ -183,7 +183,7 @@ fn replaces_in_place(launches: &[Launch], value: BufferId, old: BufferId, buffer
             RegionOp::Linear(w) => w.buffer != old,
             _ => true,
         })
-        && (region.grain == region::Grain::Row || region.keeps_channels_of(&[old], |_| true));
+        && (region.grain != region::Grain::Lane || region.keeps_channels_of(&[old], |_| true));
     let later = launches[writer + 1..].iter().any(|l| l.region.reads().contains(&old));
     whole && elementwise && !later
 }

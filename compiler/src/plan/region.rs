@@ -134,6 +134,8 @@ pub enum Grain {
     Row,
     /// One channel of one position: wide layers.
     Lane,
+    /// A workgroup shares a tile of positions, or a line of them, and keeps what its layers read.
+    Tile,
 }
 
 /// One fused launch.

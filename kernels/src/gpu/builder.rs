@@ -292,6 +292,15 @@ impl Builder {
         self.loaded(pointer, memory.kind, false)
     }
 
+    /// An element of workgroup memory, known to be the same for all invocations; all wait for each other.
+    pub fn load_uniform(&mut self, memory: Memory, index: Value) -> Value {
+        let pointer = self.at(memory, index);
+        let ty = self.ty(memory.kind, memory.vector);
+        let result = self.append(Expression::WorkGroupUniformLoadResult { ty });
+        self.push(Statement::WorkGroupUniformLoad { pointer, result });
+        Value { handle: result, kind: memory.kind, vector: memory.vector }
+    }
+
     fn loaded(&mut self, pointer: Handle<Expression>, kind: Kind, vector: bool) -> Value {
         let handle = self.emit(Expression::Load { pointer });
         let raw = Value { handle, kind, vector };
@@ -649,6 +658,13 @@ impl Builder {
     /// The same, and for storage buffers, too.
     pub fn barrier_of_storage(&mut self) {
         self.push(Statement::ControlBarrier(naga::Barrier::WORK_GROUP | naga::Barrier::STORAGE));
+    }
+
+    /// Ends a loop.
+    pub fn break_if(&mut self, condition: Value) {
+        let mut leave = Block::new();
+        leave.push(Statement::Break, Span::UNDEFINED);
+        self.push(Statement::If { condition: condition.handle, accept: leave, reject: Block::new() });
     }
 
     pub fn leave(&mut self) {

@@ -76,7 +76,7 @@ pub(super) fn own_cost(region: &Region, at: usize) -> usize {
 }
 
 /// Scalar instructions for one channel, operands included, each computed for it alone.
-fn lane_costs(region: &Region) -> Vec<usize> {
+pub(super) fn lane_costs(region: &Region) -> Vec<usize> {
     let mut costs: Vec<usize> = vec![];
     for (at, inst) in region.body.iter().enumerate() {
         let own = own_cost(region, at);

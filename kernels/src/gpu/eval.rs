@@ -36,7 +36,7 @@ pub(super) struct Values<'r> {
     region: &'r Region,
     at: Vec<Position>,
     /// Axes along which the four positions neighbour, the first at a multiple of four.
-    neighbours: Option<Axes>,
+    neighbours: Vec<Axes>,
     /// Values with the block they were built in.
     known: HashMap<(InstId, Channel), (Value, u32)>,
     eigen: HashMap<InstId, (Memory, u32)>,
@@ -52,7 +52,7 @@ impl<'r> Values<'r> {
         Values {
             region,
             at,
-            neighbours: None,
+            neighbours: vec![],
             known: HashMap::new(),
             eigen: HashMap::new(),
             stored: HashMap::new(),
@@ -80,7 +80,7 @@ impl<'r> Values<'r> {
     /// Says that the positions are four neighbours in `rows`, the first at a multiple of four, so that a kernel `with_vectors`
     /// loads them at once.
     pub fn side_by_side(mut self, rows: &Axes) -> Values<'r> {
-        self.neighbours = Some(rows.clone());
+        self.neighbours.push(rows.clone());
         self
     }
 
@@ -179,7 +179,7 @@ impl<'r> Values<'r> {
     fn load(&mut self, e: &mut Emit, buffer: BufferId, channel: Channel) -> Value {
         let (axes, dtype) = (e.layout.shape(buffer).axes.clone(), e.layout.shape(buffer).dtype);
         let channel = channel.value(e);
-        if dtype == DType::F32 && self.neighbours.as_ref().is_some_and(|rows| is_run(&axes, rows)) {
+        if dtype == DType::F32 && self.neighbours.iter().any(|rows| is_run(&axes, rows)) {
             let element = self.at[0].element(e, &axes);
             let at = e.index(buffer, channel, element);
             return e.load_four(buffer, at);

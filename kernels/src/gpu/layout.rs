@@ -84,6 +84,8 @@ pub enum ArenaId {
     Input(usize),
     /// Of the program's own arenas.
     Own(usize),
+    /// Memory of a workgroup, in a kernel of a resident network.
+    Workgroup,
 }
 
 /// Where a buffer lies: its lanes in order, `stretch` of them in every part but the last.
@@ -139,14 +141,17 @@ pub struct Layout<'a> {
     half: bool,
     /// Scratch arenas of this launch: next free lane of each.
     scratch: Vec<(usize, u64)>,
+    /// Memory of a workgroup of this kernel.
+    workgroup: Arena,
 }
 
 impl<'a> Layout<'a> {
     pub fn new(program: &Program, inputs: &'a mut Inputs, limits: &Limits) -> Result<Layout<'a>, LowerError> {
         // Whole stretches of aligned lanes, at least one.
         let max_lanes = ((limits.max_binding / 4).min(u32::MAX as u64) / ALIGN * ALIGN).max(ALIGN);
-        let mut layout =
-            Layout { inputs, own: vec![], buffers: vec![], max_lanes, half: limits.half.is_some(), scratch: vec![] };
+        let half = limits.half.is_some();
+        let workgroup = Arena { name: "tile".into(), storage: Storage::F32, lanes: 0 };
+        let mut layout = Layout { inputs, own: vec![], buffers: vec![], max_lanes, half, scratch: vec![], workgroup };
         layout.inputs.sealed = layout.inputs.arenas.len();
         // A slot may hold floats for some launches and halves for others.
         let mut slots: BTreeMap<(usize, bool), Place> = BTreeMap::new();
@@ -218,6 +223,18 @@ impl<'a> Layout<'a> {
         self.scratch_stored(name, shape, storage)
     }
 
+    /// Starts a kernel whose workgroups hold so many lanes.
+    pub fn hold(&mut self, lanes: u32) {
+        self.workgroup.lanes = u64::from(lanes);
+    }
+
+    /// A buffer of floats in the memory of a workgroup, from lane `offset` on.
+    pub fn in_workgroup(&mut self, name: &str, shape: Shape, offset: u32) -> BufferId {
+        let parts = vec![Part { arena: ArenaId::Workgroup, offset }];
+        self.buffers.push((Place { parts, stretch: u32::MAX, storage: Storage::F32 }, shape, name.into()));
+        BufferId(self.buffers.len() as u32 - 1)
+    }
+
     /// Neighbouring channels of a buffer as a buffer of their own, if it lies in one piece and they begin at a multiple of four
     /// lanes.
     pub fn slice(&mut self, buffer: BufferId, channels: Range<usize>) -> Option<BufferId> {
@@ -273,6 +290,7 @@ impl<'a> Layout<'a> {
         match id {
             ArenaId::Input(i) => &self.inputs.arenas[i],
             ArenaId::Own(i) => &self.own[i],
+            ArenaId::Workgroup => &self.workgroup,
         }
     }
 

@@ -18,6 +18,8 @@ pub(super) struct Emit<'l, 'a> {
     pub b: Builder,
     pub layout: &'l Layout<'a>,
     bound: Vec<(ArenaId, Memory, bool)>,
+    /// What a workgroup of a resident network shares.
+    shared: Option<Memory>,
     /// Buffers that the kernel reads (false) or writes (true).
     touched: BTreeSet<(BufferId, bool)>,
     /// Workgroup number in a dispatch of one dimension.
@@ -53,6 +55,7 @@ impl<'l, 'a> Emit<'l, 'a> {
             b,
             layout,
             bound: vec![],
+            shared: None,
             touched: BTreeSet::new(),
             workgroup,
             invocation,
@@ -101,6 +104,12 @@ impl<'l, 'a> Emit<'l, 'a> {
     }
 
     fn memory(&mut self, arena: ArenaId, write: bool) -> Memory {
+        if arena == ArenaId::Workgroup {
+            let Arena { name, lanes, .. } = self.layout.arena(arena);
+            let (vectors, lanes) = (self.vectors, *lanes as u32);
+            let size = if vectors { lanes.div_ceil(4) } else { lanes };
+            return *self.shared.get_or_insert_with(|| self.b.workgroup(name, Kind::F32, vectors, size));
+        }
         if let Some(known) = self.bound.iter_mut().find(|b| b.0 == arena) {
             if write && !known.2 {
                 known.2 = true;
@@ -235,6 +244,9 @@ impl<'l, 'a> Emit<'l, 'a> {
         let mut accesses = vec![];
         for (buffer, write) in &self.touched {
             let place = self.layout.place(*buffer);
+            if place.parts[0].arena == ArenaId::Workgroup {
+                continue;
+            }
             let pieces = place.pieces(0..self.layout.shape(*buffer).lanes());
             accesses.extend(pieces.into_iter().map(|(part, lanes)| {
                 let first = u64::from(part.offset);

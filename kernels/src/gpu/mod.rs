@@ -9,6 +9,7 @@
 //! | `parts`, `stages` | a region cut into what one kind of kernel does, and long work into stages |
 //! | `elements`, `reduce`, `chunks`, `scatter`, `scan`, `layer`, `outer` | the kinds of kernels |
 //! | `tile`, `direct`, `sums`, `give`, `epilogue` | matrix products in tiles, and what is done with their sums |
+//! | `resident`, `phases`, `resident_layer`, `vanish` | whole narrow networks in a workgroup's memory |
 //! | `peak` | kernels that measure a device |
 
 mod builder;
@@ -28,13 +29,17 @@ mod naming;
 mod outer;
 mod parts;
 mod peak;
+mod phases;
 mod reduce;
+mod resident;
+mod resident_layer;
 mod scalar;
 mod scan;
 mod scatter;
 mod stages;
 mod sums;
 mod tile;
+mod vanish;
 
 pub use half::{Half, Matrices, Storage, storages};
 pub use layout::{Arena, ArenaId, Inputs, Limits, Part, Place, SOFTWARE_TILES, TILES};

@@ -9,7 +9,7 @@
 use super::elements::{self, closure};
 use super::half::is_multiplied;
 use super::layout::{Layout, Limits};
-use super::{Kernel, LowerError, layer, outer, reduce, scan, scatter, stages};
+use super::{Kernel, LowerError, layer, outer, reduce, resident, scan, scatter, stages};
 use raygrad_compiler::graph::{Axes, Shape};
 use raygrad_compiler::ops::Reduction;
 use raygrad_compiler::ops::pick::runs;
@@ -36,6 +36,7 @@ enum Part {
     Reduce(Region),
     Outer(Region),
     Scatter(Region),
+    Resident(Region),
 }
 
 impl Part {
@@ -46,7 +47,8 @@ impl Part {
             | Part::Scan(r)
             | Part::Reduce(r)
             | Part::Outer(r)
-            | Part::Scatter(r) => r,
+            | Part::Scatter(r)
+            | Part::Resident(r) => r,
         }
     }
 }
@@ -82,6 +84,7 @@ pub(super) fn lower(layout: &mut Layout, limits: Limits, launch: &Launch) -> Res
             Part::Reduce(r) => kernels.extend(reduce::kernels(layout, limits, &name, &r)?),
             Part::Outer(r) => kernels.extend(outer::kernels(layout, limits, &name, &r)?),
             Part::Scatter(r) => kernels.extend(scatter::kernels(layout, limits, &name, &r)?),
+            Part::Resident(r) => kernels.push(resident::kernel(layout, limits, &name, &r)?),
         }
     }
     Ok(kernels)
@@ -95,6 +98,7 @@ fn part_name(part: &Part, i: usize) -> String {
         Part::Reduce(_) => "reduce",
         Part::Outer(_) => "outer",
         Part::Scatter(_) => "scatter",
+        Part::Resident(_) => "network",
     };
     format!("{}_{kind}", i + 1)
 }
@@ -112,7 +116,8 @@ impl Split<'_, '_> {
         let (writes, others): (Vec<Store>, Vec<Store>) =
             self.region.stores.clone().into_iter().partition(|s| matches!(s, Store::Write { .. }));
         self.region.stores = writes;
-        if !self.region.whole {
+        let resident = resident::is_resident(&self.region);
+        if !self.region.whole && !resident {
             self.slice_concatenations(&others);
         }
         let homes = Homes::of(&self.region);
@@ -120,7 +125,10 @@ impl Split<'_, '_> {
         let mut recomputed: Vec<Store> = vec![];
         let mut reloaded: Vec<Store> = vec![];
         for store in others {
-            if self.region.whole && self.is_along_lines(&store) {
+            if resident {
+                let over_line = resident::is_over_line(self.layout, &self.region, &store);
+                if over_line { on_lines.push(store) } else { reloaded.push(store) }
+            } else if self.region.whole && self.is_along_lines(&store) {
                 on_lines.push(store);
             } else if !self.region.whole && self.is_layers_total(&homes, &store) {
                 in_layers.push(store);
@@ -336,11 +344,13 @@ impl Split<'_, '_> {
 
     /// Parts for values written element by element, and for reductions along a scan's lines or of what layers compute.
     fn write(&mut self, homes: &Homes, on_lines: Vec<Store>, in_layers: Vec<Store>) -> Result<(), LowerError> {
-        if self.region.whole {
+        let resident = resident::is_resident(&self.region);
+        if self.region.whole || resident {
             let mut region = self.region.clone();
             region.stores.extend(on_lines);
             if !region.stores.is_empty() {
-                self.writers.push(Part::Scan(region.swept()));
+                let region = region.swept();
+                self.writers.push(if resident { Part::Resident(region) } else { Part::Scan(region) });
             }
             return Ok(());
         }

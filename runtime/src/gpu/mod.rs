@@ -175,7 +175,7 @@ impl<A: Api> Executor for GpuExecutor<A> {
         if program.target.kind != TargetKind::Gpu {
             return Err(RunError::Target(program.target.kind));
         }
-        let Forms { half, tiles } = self.forms;
+        let Forms { half, tiles, .. } = self.forms;
         let lowered = lower(&program, &mut self.inputs, &Limits { half, tiles, ..self.api.limits() })
             .map_err(|e| self.lower_error(e))?;
         for arena in &self.inputs.arenas[self.arenas.len()..] {
@@ -241,7 +241,7 @@ impl<A: Api> Executor for GpuExecutor<A> {
 fn of_inputs(part: &Part) -> Option<usize> {
     match part.arena {
         ArenaId::Input(arena) => Some(arena),
-        ArenaId::Own(_) => None,
+        ArenaId::Own(_) | ArenaId::Workgroup => None,
     }
 }
 
@@ -279,5 +279,6 @@ pub(crate) fn bound<'a, B>(arena: ArenaId, inputs: &'a [B], own: &'a [B]) -> &'a
     match arena {
         ArenaId::Input(i) => &inputs[i],
         ArenaId::Own(i) => &own[i],
+        ArenaId::Workgroup => unreachable!("workgroup memory is inside kernels, which bind none of it"),
     }
 }

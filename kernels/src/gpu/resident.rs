@@ -1,0 +1,489 @@
+//! Kernels of resident networks: a workgroup takes a tile of rows through all layers, in its own memory.
+//!
+//! Where a region scans along its inner axis or sums over many short lines of it, a workgroup follows a whole line, tile by
+//! tile: from encoding to the last sum in one kernel, which is how rays are rendered.
+//!
+//! What is kept lies `[channel][row]`, values whose lives do not overlap in the same place. What does not fit, even of the
+//! smallest tiles, lies in scratch memory.
+
+use super::builder::{Kind, Value, Var};
+use super::eval::{Channel, Values};
+use super::layout::{Layout, Limits};
+use super::memory::{Emit, Position, is_run};
+use super::phases::{Phase, Phases};
+use super::reduce::{combine, neutral};
+use super::resident_layer;
+use super::vanish::vanishing;
+use super::{Kernel, LowerError};
+use naga::MathFunction as Math;
+use raygrad_compiler::graph::{Axes, Axis, Shape};
+use raygrad_compiler::plan::region::{BufferId, Inst, InstId, Region, RegionOp, Store};
+use raygrad_compiler::scalar::DType;
+use std::collections::HashMap;
+
+/// Rows of a tile, largest first.
+const ROWS: [u32; 3] = [64, 32, 16];
+/// Invocations a row.
+pub(super) const PER_ROW: u32 = 4;
+/// Lines from which workgroups that follow one each fill a device ...
+const MANY_LINES: usize = 256;
+/// ... and elements of a line up to which it does not take too long.
+const LONG_LINE: usize = 1024;
+/// Most channels that are combined over a line: one an invocation of the smallest tile.
+const LINE_CHANNELS: usize = 32;
+
+/// Whether a region is for a kernel of this kind.
+pub(super) fn is_resident(region: &Region) -> bool {
+    region.grain == raygrad_compiler::plan::region::Grain::Tile
+        && region.body.iter().any(|i| matches!(i.op, RegionOp::Linear(_)))
+}
+
+/// Whether workgroups follow lines, and a store is a combination over one.
+pub(super) fn is_over_line(layout: &Layout, region: &Region, store: &Store) -> bool {
+    let (Store::Reduce { value, buffer, .. }, Some(inner)) = (store, &region.inner) else { return false };
+    let outer = region.domain.without(inner);
+    let pays = region.whole || outer.elements() >= MANY_LINES && inner.size() <= LONG_LINE;
+    pays && layout.shape(*buffer).axes == outer && region.inst(*value).channels <= LINE_CHANNELS
+}
+
+/// The kernel of a region whose stores write, or are combined over lines.
+pub(super) fn kernel(layout: &mut Layout, limits: Limits, name: &str, region: &Region) -> Result<Kernel, LowerError> {
+    let phases = Phases::of(region);
+    let inner = Axes::new(region.inner.clone());
+    let lines = region.whole || region.stores.iter().any(|s| matches!(s, Store::Reduce { .. }));
+    // A tile has one set of weights.
+    let of_weights = region.body.iter().filter_map(|i| match &i.op {
+        RegionOp::Linear(w) => Some(layout.shape(w.buffer).axes.clone()),
+        _ => None,
+    });
+    let batch = match lines {
+        true => region.domain.minus(&inner),
+        false => region.domain.minus(&region.domain.minus(&of_weights.fold(Axes::none(), |a, b| a.union(&b)))),
+    };
+    let rows = region.domain.minus(&batch);
+    let tile = tile_of(&phases, rows.elements() as u32, limits.max_workgroup_bytes);
+    let tile_rows = Axes::new([Axis::new("tile", tile.rows as usize)]);
+    layout.hold(tile.lanes);
+    let mut places = HashMap::new();
+    for id in phases.region.ids().filter(|id| phases.kept[id.0 as usize]) {
+        let inst = phases.region.inst(id);
+        let place = match tile.offsets.get(&id) {
+            Some(offset) => {
+                let shape = Shape::of(tile_rows.clone(), inst.channels, DType::F32);
+                layout.in_workgroup(&inst.label, shape, *offset)
+            }
+            None => layout.scratch(&inst.label, Shape::of(region.domain.clone(), inst.channels, DType::F32))?,
+        };
+        places.insert(id, place);
+    }
+    let spilled = places.len() > tile.offsets.len();
+    let network = Network { phases, places, batch, rows, tile_rows, tile: tile.rows, lines, spilled };
+    network.kernel(layout, limits, name)
+}
+
+struct Tile {
+    rows: u32,
+    /// Lane of the workgroup's memory where a value begins; of those that it holds.
+    offsets: HashMap<InstId, u32>,
+    lanes: u32,
+}
+
+/// The largest tile whose values a workgroup can hold; or the smallest, with those that fit.
+fn tile_of(phases: &Phases, rows: u32, bytes: u32) -> Tile {
+    let useful = |r: &u32| *r == ROWS[ROWS.len() - 1] || r / 2 < rows;
+    let kept = phases.kept.iter().filter(|k| **k).count();
+    let tiles: Vec<Tile> = ROWS.into_iter().filter(useful).map(|rows| place(phases, rows, bytes / 4)).collect();
+    let whole = tiles.iter().position(|t| t.offsets.len() == kept).unwrap_or(tiles.len() - 1);
+    tiles.into_iter().nth(whole).unwrap_or_else(|| unreachable!("the smallest tile is always there"))
+}
+
+/// Places for what is kept, first come, first served.
+fn place(phases: &Phases, rows: u32, most: u32) -> Tile {
+    // A layer has read what it needs when it writes. Everything else writes as it reads.
+    let mut lives: Vec<(InstId, usize, usize)> = vec![];
+    for (at, phase) in phases.all.iter().enumerate() {
+        let from = 2 * at + usize::from(matches!(phase, Phase::Layer { .. }));
+        for id in phase.results().into_iter().filter(|id| phases.kept[id.0 as usize]) {
+            let last = (at..phases.all.len()).filter(|p| phases.reads(*p).contains(&id)).map(|p| 2 * p).max();
+            lives.push((id, from, last.unwrap_or(from).max(from)));
+        }
+    }
+    let mut taken: Vec<(u32, u32, usize, usize)> = vec![];
+    let mut offsets = HashMap::new();
+    for (id, from, to) in lives {
+        let lanes = phases.region.inst(id).channels as u32 * rows;
+        let mut beside: Vec<(u32, u32)> =
+            taken.iter().filter(|t| t.2 <= to && from <= t.3).map(|t| (t.0, t.1)).collect();
+        beside.sort();
+        let offset = beside.iter().fold(0, |at, (first, end)| if at + lanes <= *first { at } else { at.max(*end) });
+        if offset + lanes <= most {
+            taken.push((offset, offset + lanes, from, to));
+            offsets.insert(id, offset);
+        }
+    }
+    Tile { rows, offsets, lanes: taken.iter().map(|t| t.1).max().unwrap_or(0) }
+}
+
+pub(super) struct Network {
+    pub phases: Phases,
+    /// Where what is kept lies.
+    pub places: HashMap<InstId, BufferId>,
+    /// Axes of which a workgroup has one element.
+    pub batch: Axes,
+    /// Those along which its tiles run.
+    rows: Axes,
+    /// That of what a workgroup holds.
+    tile_rows: Axes,
+    /// Rows of a tile.
+    pub tile: u32,
+    lines: bool,
+    spilled: bool,
+}
+
+/// Where a tile begins.
+#[derive(Clone, Copy)]
+pub(super) struct First {
+    pub batch: Value,
+    pub row: Value,
+}
+
+/// What an invocation carries along a line, a variable a channel that it has.
+struct Carried {
+    sums: Vec<(InstId, Var)>,
+    totals: Vec<(Store, Var)>,
+}
+
+impl Network {
+    fn kernel(&self, layout: &Layout, limits: Limits, name: &str) -> Result<Kernel, LowerError> {
+        let (count, batches) = (self.rows.elements() as u32, self.batch.elements() as u64);
+        let tiles = if self.lines { 1 } else { count.div_ceil(self.tile) };
+        let groups = batches * u64::from(tiles);
+        let mut e = Emit::new(layout, limits, groups, PER_ROW * self.tile)?.with_vectors(true);
+        if e.spare_workgroups() {
+            e.leave_from(e.workgroup, groups as u32);
+        }
+        let (across, size) = (e.b.u(tiles), e.b.u(self.tile));
+        let (own, batch) = (e.b.rem(e.workgroup, across), e.b.div(e.workgroup, across));
+        e.b.name(batch, "batch");
+        if !self.lines {
+            let row = e.b.mul(own, size);
+            e.b.name(row, "first_row");
+            self.tile(&mut e, First { batch, row }, &Carried { sums: vec![], totals: vec![] });
+            return e.finish(name);
+        }
+        let carried = self.carried(&mut e);
+        let stop = vanishing(&self.phases.region).map(|id| (id, e.b.workgroup("seen", Kind::F32, false, 1)));
+        let (from, to) = (e.b.u(0), e.b.u(count));
+        let row = e.b.open_loop("row", from, to, self.tile);
+        e.b.barrier();
+        self.tile(&mut e, First { batch, row }, &carried);
+        if let Some((id, seen)) = stop {
+            let (first, zero) = (e.b.u(0), e.b.f(0.0));
+            e.if_below(e.invocation, Some(1), |e| {
+                let sum = carried.sums.iter().find(|s| s.0 == id).map_or(zero, |s| e.b.get(s.1));
+                e.b.store(seen, first, sum);
+            });
+            e.b.barrier();
+            let seen = e.b.load_uniform(seen, first);
+            let enough = e.b.less(zero, seen);
+            e.b.break_if(enough);
+        }
+        e.b.close_loop();
+        self.finish(&mut e, First { batch, row: from }, &carried);
+        e.finish(name)
+    }
+
+    fn carried(&self, e: &mut Emit) -> Carried {
+        let (zero, region) = (e.b.f(0.0), &self.phases.region);
+        let scans = self.phases.all.iter().filter_map(|p| if let Phase::Scan(id) = p { Some(*id) } else { None });
+        let sums = scans.map(|id| (id, e.b.var("before", zero))).collect();
+        let mut totals = vec![];
+        for store in &region.stores {
+            if let Store::Reduce { kind, .. } = store {
+                let first = neutral(&mut e.b, *kind);
+                totals.push((store.clone(), e.b.var("total", first)));
+            }
+        }
+        Carried { sums, totals }
+    }
+
+    /// All phases of one tile.
+    fn tile(&self, e: &mut Emit, first: First, carried: &Carried) {
+        for (at, phase) in self.phases.all.iter().enumerate() {
+            if at > 0 {
+                if self.spilled { e.b.barrier_of_storage() } else { e.b.barrier() }
+            }
+            let region = self.phases.seen_by(at, |id| self.load(e.layout, id));
+            match phase {
+                Phase::Rows(ids) => self.rows(e, &region, ids, first),
+                Phase::Lanes(id) => self.lanes(e, &region, *id, first),
+                Phase::Layer { linear, results } => resident_layer::emit(self, e, &region, (*linear, results), first),
+                Phase::Scan(id) => self.scan(e, *id, first, carried),
+                Phase::Totals => self.totals(e, first, carried),
+            }
+        }
+    }
+
+    /// A kept value as a load.
+    fn load(&self, layout: &Layout, id: InstId) -> Inst {
+        let (buffer, inst) = (self.places[&id], self.phases.region.inst(id));
+        let axes = layout.shape(buffer).axes.clone();
+        Inst { op: RegionOp::Load(buffer), inputs: vec![], axes, ..inst.clone() }
+    }
+
+    /// Rows of the last tile do not fill it.
+    fn is_ragged(&self) -> bool {
+        !(self.rows.elements() as u32).is_multiple_of(self.tile)
+    }
+
+    /// Whether four neighbouring rows from a multiple of four on all exist or all do not.
+    fn in_fours(&self) -> bool {
+        self.rows.elements().is_multiple_of(4)
+    }
+
+    /// Row `own` of a tile; what lies behind the last row is the last one again.
+    fn position(&self, e: &mut Emit, first: First, own: Value) -> Position {
+        let mut row = e.b.add(first.row, own);
+        if self.is_ragged() {
+            let last = e.b.u(self.rows.elements() as u32 - 1);
+            row = e.b.math(Math::Min, &[row, last]);
+        }
+        self.at(first.batch, row, own)
+    }
+
+    fn at(&self, batch: Value, row: Value, own: Value) -> Position {
+        let position = match self.batch.is_empty() {
+            true => Position::new(&self.rows, row),
+            false => Position::new(&self.batch, batch).and(&self.rows, row),
+        };
+        position.and(&self.tile_rows, own)
+    }
+
+    /// Values at four neighbouring rows of a tile, from `own` on, a multiple of four.
+    pub fn four<'r>(&self, e: &mut Emit, region: &'r Region, first: First, own: Value) -> Values<'r> {
+        let mut all = vec![];
+        let whole = self.in_fours();
+        let mut row = e.b.add(first.row, own);
+        if whole && self.is_ragged() {
+            let last = e.b.u(self.rows.elements() as u32 - 4);
+            row = e.b.math(Math::Min, &[row, last]);
+        }
+        for i in 0..4 {
+            let offset = e.b.u(i);
+            let own = e.b.add(own, offset);
+            all.push(match whole {
+                true => {
+                    let row = e.b.add(row, offset);
+                    self.at(first.batch, row, own)
+                }
+                false => self.position(e, first, own),
+            });
+        }
+        let values = Values::new(region, all).side_by_side(&self.tile_rows);
+        if whole { values.side_by_side(&self.rows) } else { values }
+    }
+
+    /// Puts a channel of one row, or of four, where it is kept and written.
+    pub fn put(&self, e: &mut Emit, id: InstId, channel: Value, first: First, own: Value, value: Value) {
+        if let Some(place) = self.kept(id) {
+            self.set(e, place, channel, first, own, value);
+        }
+        for buffer in self.written(id) {
+            self.set(e, buffer, channel, first, own, value);
+        }
+    }
+
+    /// Where a value is kept.
+    pub fn kept(&self, id: InstId) -> Option<BufferId> {
+        self.places.get(&id).copied()
+    }
+
+    /// Buffers that a value is written to.
+    pub fn written(&self, id: InstId) -> Vec<BufferId> {
+        let written = |s: &Store| match s {
+            Store::Write { value, buffer } if *value == id => Some(*buffer),
+            _ => None,
+        };
+        self.phases.region.stores.iter().filter_map(written).collect()
+    }
+
+    /// Sets a channel of one row of a buffer, or of four neighbours.
+    pub fn set(&self, e: &mut Emit, buffer: BufferId, channel: Value, first: First, own: Value, value: Value) {
+        let axes = e.layout.shape(buffer).axes.clone();
+        let held = axes == self.tile_rows;
+        let count = if value.vector { 4 } else { 1 };
+        let floats = e.layout.shape(buffer).dtype == DType::F32;
+        let row = e.b.add(first.row, own);
+        let end = (!held && self.is_ragged()).then(|| self.rows.elements() as u32);
+        if value.vector && floats && (held || self.in_fours() && is_run(&axes, &self.rows)) {
+            return e.if_below(row, end, |e| {
+                let element = self.at(first.batch, row, own).element(e, &axes);
+                let at = e.index(buffer, channel, element);
+                e.store_four(buffer, at, value);
+            });
+        }
+        for i in 0..count {
+            let offset = e.b.u(i);
+            let (row, own) = (e.b.add(row, offset), e.b.add(own, offset));
+            e.if_below(row, end, |e| {
+                let element = self.at(first.batch, row, own).element(e, &axes);
+                let at = e.index(buffer, channel, element);
+                let lane = if value.vector { e.b.component(value, i) } else { value };
+                e.store(buffer, at, lane);
+            });
+        }
+    }
+
+    /// An invocation a row.
+    fn rows(&self, e: &mut Emit, region: &Region, ids: &[InstId], first: First) {
+        let own = e.invocation;
+        e.if_below(own, Some(self.tile), |e| {
+            let position = self.position(e, first, own);
+            let mut values = Values::new(region, vec![position]);
+            for id in ids {
+                for (c, value) in values.all(e, *id).into_iter().enumerate() {
+                    let c = e.b.u(c as u32);
+                    self.put(e, *id, c, first, own, value);
+                }
+            }
+        });
+    }
+
+    /// An invocation a channel of four rows, or of one where not everything can be computed side by side.
+    fn lanes(&self, e: &mut Emit, region: &Region, id: InstId, first: First) {
+        use RegionOp::{ChannelSum, Const, Index, Load, Map, Pick, RowOuter};
+        let simple =
+            |i: &Inst| matches!(i.op, Load(_) | Const(_) | Map(_) | Pick(_) | Index(_) | ChannelSum(_) | RowOuter);
+        let needed = super::elements::closure(region, [id]);
+        let fours =
+            region.body.iter().zip(&needed).all(|(i, n)| !n || simple(i)) && region.inst(id).dtype == DType::F32;
+        let (each, channels) = (if fours { 4 } else { 1 }, region.inst(id).channels as u32);
+        let (across, count) = (self.tile / each, self.tile / each * channels);
+        let invocations = PER_ROW * self.tile;
+        let (none, all) = (e.b.u(0), e.b.u(count));
+        let before = e.b.open_loop("lane", none, all, invocations);
+        let number = e.b.add(before, e.invocation);
+        let spare = !count.is_multiple_of(invocations);
+        e.if_below(number, spare.then_some(count), |e| {
+            let (width, each) = (e.b.u(across), e.b.u(each));
+            let (channel, own) = (e.b.div(number, width), e.b.rem(number, width));
+            let own = e.b.mul(own, each);
+            e.b.name(channel, "channel");
+            e.b.name(own, "own_row");
+            let mut values = match fours {
+                true => self.four(e, region, first, own),
+                false => {
+                    let position = self.position(e, first, own);
+                    Values::new(region, vec![position])
+                }
+            };
+            let value = values.channel(e, id, Channel::Var(channel));
+            let value = if fours { e.b.splat(value) } else { value };
+            self.put(e, id, channel, first, own, value);
+        });
+        e.b.close_loop();
+    }
+
+    /// An invocation a channel runs along the tile, with what it carries from the tiles before.
+    fn scan(&self, e: &mut Emit, id: InstId, first: First, carried: &Carried) {
+        let region = &self.phases.region;
+        let term = self.places[&region.inst(id).inputs[0]];
+        let Some((_, sum)) = carried.sums.iter().find(|s| s.0 == id) else { return };
+        e.if_below(e.invocation, Some(region.inst(id).channels as u32), |e| {
+            let channel = e.invocation;
+            let (none, all) = (e.b.u(0), e.b.u(self.tile));
+            let own = e.b.open_loop("own_row", none, all, 1);
+            let before = e.b.get(*sum);
+            let term = self.held(e, term, channel, first, own);
+            self.put(e, id, channel, first, own, before);
+            let after = e.b.add(before, term);
+            e.b.set(*sum, after);
+            e.b.close_loop();
+        });
+    }
+
+    /// A channel of a row of what is kept.
+    fn held(&self, e: &mut Emit, place: BufferId, channel: Value, first: First, own: Value) -> Value {
+        let axes = e.layout.shape(place).axes.clone();
+        let position = self.position(e, first, own);
+        let element = position.element(e, &axes);
+        let at = e.index(place, channel, element);
+        e.load(place, at)
+    }
+
+    /// A channel of four rows of what is kept.
+    pub fn held_four(&self, e: &mut Emit, place: BufferId, channel: Value, first: First, own: Value) -> Value {
+        let axes = e.layout.shape(place).axes.clone();
+        if axes != self.tile_rows && !(self.in_fours() && is_run(&axes, &self.rows)) {
+            let mut all = vec![];
+            for i in 0..4 {
+                let offset = e.b.u(i);
+                let own = e.b.add(own, offset);
+                all.push(self.held(e, place, channel, first, own));
+            }
+            return e.b.vector([all[0], all[1], all[2], all[3]]);
+        }
+        let mut row = e.b.add(first.row, own);
+        if self.is_ragged() && axes != self.tile_rows {
+            let last = e.b.u(self.rows.elements() as u32 - 4);
+            row = e.b.math(Math::Min, &[row, last]);
+        }
+        let element = self.at(first.batch, row, own).element(e, &axes);
+        let at = e.index(place, channel, element);
+        e.load_four(place, at)
+    }
+
+    /// A workgroup's element of axes that its tiles do not run along.
+    pub fn batch_element(&self, e: &mut Emit, first: First, axes: &Axes) -> Value {
+        Position::new(&self.batch, first.batch).element(e, axes)
+    }
+
+    /// An invocation a channel combines the rows of a tile.
+    fn totals(&self, e: &mut Emit, first: First, carried: &Carried) {
+        let mut before = 0;
+        for (store, total) in &carried.totals {
+            let Store::Reduce { kind, value, .. } = store else { continue };
+            let channels = self.phases.region.inst(*value).channels as u32;
+            self.own_channel(e, (before, channels), |e, channel| {
+                let (none, all) = (e.b.u(0), e.b.u(self.tile));
+                let mut end = all;
+                if self.is_ragged() {
+                    let count = e.b.u(self.rows.elements() as u32);
+                    let left = e.b.sub(count, first.row);
+                    end = e.b.math(Math::Min, &[all, left]);
+                }
+                let own = e.b.open_loop("own_row", none, end, 1);
+                let next = self.held(e, self.places[value], channel, first, own);
+                let so_far = e.b.get(*total);
+                let next = combine(&mut e.b, *kind, so_far, next);
+                e.b.set(*total, next);
+                e.b.close_loop();
+            });
+            before = (before + channels) % (PER_ROW * ROWS[ROWS.len() - 1] - LINE_CHANNELS as u32);
+        }
+    }
+
+    /// Writes what was combined over the line.
+    fn finish(&self, e: &mut Emit, first: First, carried: &Carried) {
+        let mut before = 0;
+        for (store, total) in &carried.totals {
+            let Store::Reduce { value, buffer, .. } = store else { continue };
+            let channels = self.phases.region.inst(*value).channels as u32;
+            self.own_channel(e, (before, channels), |e, channel| {
+                let axes = e.layout.shape(*buffer).axes.clone();
+                let element = self.batch_element(e, first, &axes);
+                let (at, value) = (e.index(*buffer, channel, element), e.b.get(*total));
+                e.store(*buffer, at, value);
+            });
+            before = (before + channels) % (PER_ROW * ROWS[ROWS.len() - 1] - LINE_CHANNELS as u32);
+        }
+    }
+
+    /// Does something in the invocations from `before` on that have one of so many channels each.
+    fn own_channel(&self, e: &mut Emit, (before, channels): (u32, u32), act: impl FnOnce(&mut Emit, Value)) {
+        let first = e.b.u(before);
+        // Invocations before the first one wrap around to large numbers.
+        let channel = e.b.sub(e.invocation, first);
+        e.if_below(channel, Some(channels), |e| act(e, channel));
+    }
+}
