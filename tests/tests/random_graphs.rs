@@ -4,6 +4,8 @@
 //! `RAYGRAD_NIGHTLY=1` runs 10 000 of the large ones, `RAYGRAD_GRAPHS=first..end` those of some seeds. A failure prints the smallest
 //! recipe found that still fails.
 
+#[cfg(feature = "gpu")]
+use raygrad_compiler::plan::region::{Grain, Region};
 use raygrad_compiler::plan::region::RegionOp;
 use raygrad_compiler::{Program, StepError, Target, compile};
 use raygrad_runtime::Device;
@@ -20,6 +22,10 @@ fn large() -> u64 {
 
 /// Graphs of a run that are small enough for a software GPU, which takes half a second each.
 const SMALL: u64 = 500;
+
+/// Most outputs of a layer that stay in a workgroup.
+#[cfg(feature = "gpu")]
+const MOST: usize = 128;
 
 /// Those that also run through Vulkan: the kernels are the same as through wgpu.
 const THROUGH_VULKAN: u64 = 100;
@@ -124,4 +130,21 @@ fn without_vulkan() -> Vec<Device> {
 fn small_graphs_through_vulkan() {
     let devices: Vec<Device> = vulkan().into_iter().collect();
     check_graphs(&devices, Recipe::small, seeds(THROUGH_VULKAN, 0).chain(seeds(THROUGH_VULKAN, 1)));
+}
+
+/// Networks that stay in a workgroup, of the graphs that have some.
+#[cfg(feature = "gpu")]
+#[test]
+fn networks_in_workgroups() {
+    let target = Target { resident: MOST, ..Target::gpu() };
+    let has_some = |recipe: fn(u64) -> Recipe, seed: u64| {
+        let resident = |r: &Region| r.grain == Grain::Tile && r.body.iter().any(|i| matches!(i.op, RegionOp::Linear(_)));
+        compile(&recipe(seed).build().step, &target).is_ok_and(|p| p.launches.iter().any(|l| resident(&l.region)))
+    };
+    let devices: Vec<Device> = raygrad_tests::backend::resident(MOST).into_iter().take(1).collect();
+    for (recipe, count) in [(Recipe::small as fn(u64) -> Recipe, SMALL), (Recipe::new, if nightly() { 600 } else { 60 })] {
+        let found: Vec<u64> = (0..count).filter(|s| has_some(recipe, *s)).collect();
+        assert!(found.len() as u64 >= count / 20, "{} of {count} graphs", found.len());
+        check_graphs(&devices, recipe, found.into_iter());
+    }
 }
