@@ -208,6 +208,19 @@ impl Device {
         }
     }
 
+    /// Of several programs for the same step, the one that this device runs fastest: found, and kept, as by [`Device::tuned`].
+    /// Results differ by rounding.
+    #[cfg_attr(not(feature = "gpu"), expect(unused_mut))]
+    pub fn fastest(&self, mut programs: Vec<Program>) -> Result<Program, RunError> {
+        #[cfg(feature = "gpu")]
+        if programs.len() > 1 {
+            let best = crate::gpu::tune::fastest(self, &programs)?;
+            programs.swap(0, best);
+        }
+        let first = programs.into_iter().next();
+        first.ok_or_else(|| RunError::Device { device: self.name(), problem: "no program was given to choose".into() })
+    }
+
     /// Bytes of a lane of each of a program's buffers, by id.
     pub fn lane_bytes(&self, program: &Program) -> Vec<u64> {
         #[cfg(feature = "gpu")]

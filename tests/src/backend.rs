@@ -12,10 +12,14 @@ pub fn devices() -> Vec<Device> {
     std::iter::once(cpu).chain(gpus()).collect()
 }
 
-/// The devices for tests that compile a hundred kernels or more: on a software driver that takes minutes, so a GPU joins
-/// only where `RAYGRAD_NIGHTLY=1`.
+/// The devices for tests that compile a hundred kernels or more: on a software driver that takes minutes, so GPUs, and one
+/// where networks stay in a workgroup, join only where `RAYGRAD_NIGHTLY=1`.
 pub fn devices_for_large_programs() -> Vec<Device> {
-    devices().into_iter().take(if nightly() { usize::MAX } else { 1 }).collect()
+    #[cfg(feature = "gpu")]
+    let resident = resident(128).into_iter().take(1);
+    #[cfg(not(feature = "gpu"))]
+    let resident = None;
+    devices().into_iter().chain(resident).take(if nightly() { usize::MAX } else { 1 }).collect()
 }
 
 /// Whether tests that take minutes run too.

@@ -31,10 +31,12 @@ fn excess(kernel: &Kernel) -> Vec<String> {
 }
 
 fn check(name: &str, step: &Step) {
-    let program = compile(step, &Target::gpu()).unwrap_or_else(|e| panic!("{name}: {e}"));
-    for tiles in 0..TILES {
+    let layered = Target::gpu();
+    let program = |target: Target| compile(step, &target).unwrap_or_else(|e| panic!("{name}: {e}"));
+    let programs = [program(layered), program(layered.with_resident(step))];
+    for (tiles, program) in (0..TILES).map(|t| (t, &programs[0])).chain([(0, &programs[1])]) {
         let limits = Limits { tiles, ..Limits::default() };
-        let lowered = lower(&program, &mut Inputs::default(), &limits);
+        let lowered = lower(program, &mut Inputs::default(), &limits);
         let lowered = lowered.unwrap_or_else(|e| panic!("{name}, tiles {tiles}: {e}"));
         let kernels: Vec<&Kernel> = lowered.launches.iter().flat_map(|l| &l.kernels).collect();
         assert!(!kernels.is_empty());

@@ -12,6 +12,8 @@ use raygrad_compiler::functions::mlp::Init;
 use raygrad_compiler::graph::{Tensor, topological};
 use raygrad_compiler::ops::identity::StopGradient;
 use raygrad_compiler::ops::input::{Input, Role};
+#[cfg(feature = "gpu")]
+use raygrad_compiler::plan::region::Grain;
 use raygrad_compiler::reference::{Array, Bindings, evaluate};
 use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Program, Step, Target, compile};
@@ -21,6 +23,9 @@ use raygrad_tests::check::check;
 use raygrad_tests::{Rng, seed, total};
 use std::collections::HashMap;
 
+/// Most outputs of a layer of a network that stays in a workgroup.
+#[cfg(feature = "gpu")]
+const RESIDENT: usize = 128;
 const VIEWS: usize = 3;
 const SIZE: ImageSize = ImageSize { height: 6, width: 8 };
 
@@ -297,6 +302,27 @@ fn a_gpu_can_run_every_kind_of_field() {
                 kernel.wgsl().unwrap_or_else(|e| panic!("{preset}: {e}"));
             }
         }
+    }
+}
+
+/// Rendered views and steps that update a pose alone, where networks stay in a workgroup: with a fine field, normalised device
+/// coordinates, and rays that end in the dark.
+#[cfg(feature = "gpu")]
+#[test]
+fn views_in_workgroups() {
+    let dark: &[&str] = &["radiance.stop_below=0.3"];
+    for (preset, set) in [("l2g-blender", dark), ("barf-llff", &[]), ("nerf-llff-repr", dark), ("garf-llff", dark)] {
+        let model = model(preset, set);
+        let view = model.view(16);
+        let bound = bind(&model, &view.roots(), &mut Rng(seed(preset)));
+        let devices: Vec<Device> = raygrad_tests::backend::resident(RESIDENT).into_iter().take(1).collect();
+        let program = compile(&view, &Target { resident: RESIDENT, ..Target::gpu() }).unwrap_or_else(|e| panic!("{e}"));
+        let over_samples = |l: &&raygrad_compiler::plan::Launch| {
+            l.region.grain == Grain::Tile && l.region.domain.iter().any(|a| ["sample", "merged"].contains(&a.name()))
+        };
+        let fields = if preset == "nerf-llff-repr" { 2 } else { 1 };
+        assert_eq!(program.launches.iter().filter(over_samples).count(), fields, "{preset}: {program}");
+        check(&devices, &view, &bound).unwrap_or_else(|e| panic!("{preset}: {e}"));
     }
 }
 

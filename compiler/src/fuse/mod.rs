@@ -23,6 +23,14 @@ mod store;
 
 pub use build::{Fused, Origin, fuse};
 
+use crate::step::Step;
+
+/// Most outputs of a layer of a resident network that is trained: weights and rows of wider ones do not fit into a workgroup side by
+/// side.
+const TRAINED: usize = 128;
+/// The same of one that nothing goes back through: what a workgroup's invocations sum up in registers.
+const RENDERED: usize = 256;
+
 /// What fusion decides by.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Target {
@@ -83,6 +91,14 @@ impl Target {
             line_rows: 0,
             lines: 0,
             resident: 0,
+        }
+    }
+
+    /// The same with resident networks, as wide as is of use to a step. A CPU's tiles hold any in any case.
+    pub fn with_resident(self, step: &Step) -> Target {
+        match self.kind {
+            TargetKind::Cpu => self,
+            TargetKind::Gpu => Target { resident: if step.updates.is_empty() { RENDERED } else { TRAINED }, ..self },
         }
     }
 }

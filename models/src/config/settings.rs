@@ -106,6 +106,8 @@ pub struct RadianceSettings {
     pub view_bands: usize,
     pub density: Density,
     pub init: FieldInit,
+    #[serde(default)]
+    pub stop_below: f64,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -227,6 +229,8 @@ pub struct Run {
     pub precision: Precision,
     #[serde(default)]
     pub autotune: bool,
+    #[serde(default)]
+    pub networks: Networks,
     pub log_every: usize,
     pub picture_every: usize,
     pub checkpoint_every: usize,

@@ -122,6 +122,10 @@ impl Layered {
             let text = format!("expected at most {MAX_BANDS} bands, found {}", radiance.view_bands);
             return Err(self.refuse("radiance.view_bands", text));
         }
+        if !(0.0..1.0).contains(&radiance.stop_below) {
+            let text = format!("expected a share of the light, 0 or more and below 1, found {}", radiance.stop_below);
+            return Err(self.refuse("radiance.stop_below", text));
+        }
         if !(train.density_noise >= 0.0 && train.density_noise.is_finite()) {
             return Err(
                 self.refuse("train.density_noise", format!("expected 0 or more, found {}", train.density_noise))

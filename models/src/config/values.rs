@@ -270,6 +270,19 @@ impl From<Precision> for raygrad_runtime::Precision {
     }
 }
 
+/// How a GPU runs networks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Networks {
+    /// As `Layered`; with `run.autotune` as is faster, of each program.
+    #[default]
+    Auto,
+    /// A layer is a launch.
+    Layered,
+    /// Rows of narrow ones stay in a workgroup through all layers, and rays of rendered views are followed whole.
+    Resident,
+}
+
 /// Where a run computes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DeviceChoice {

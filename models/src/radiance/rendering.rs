@@ -9,7 +9,7 @@ use crate::config::{DepthSettings, Settings, TrainSettings};
 use crate::fields::RadianceField;
 use crate::planar::model::weights;
 use crate::training::optimise::PROGRESS;
-use raygrad_compiler::functions::composite::{Composite, Spread, composite, depth_samples};
+use raygrad_compiler::functions::composite::{Composite, Spread, composite_above, depth_samples};
 use raygrad_compiler::functions::hierarchical::{fine_depths, merge_depths};
 use raygrad_compiler::functions::mlp::Parameter;
 use raygrad_compiler::ops::random;
@@ -37,6 +37,8 @@ pub enum Purpose {
 #[derive(Clone, Debug)]
 pub struct Rendering {
     train: TrainSettings,
+    /// Share of the light below which a rendered view's rays end.
+    stop_below: f64,
     coarse: RadianceField,
     fine: Option<RadianceField>,
 }
@@ -60,7 +62,7 @@ impl Rendering {
         let (_, train, radiance) = sections(settings)?;
         let coarse = RadianceField::new("field", &settings.field, radiance);
         let fine = (train.fine_samples > 0).then(|| RadianceField::new("fine", &settings.field, radiance));
-        Ok(Rendering { train: train.clone(), coarse, fine })
+        Ok(Rendering { train: train.clone(), stop_below: radiance.stop_below, coarse, fine })
     }
 
     pub fn parameters(&self) -> Vec<Parameter> {
@@ -109,13 +111,16 @@ impl Rendering {
             let along = axes.union(&Axes::new([axis.clone()]));
             noisy.then(|| random::normal(&along, 1, stream, &seeded_step()) * self.train.density_noise)
         };
-        let mut coarse = self.through(&self.coarse, rays, &depth, &sample, noise(&sample, DENSITY));
+        let least = if purpose == Purpose::View { self.stop_below } else { 0.0 };
+        // A fine field's samples need all weights of the coarse one.
+        let first = if self.fine.is_none() { least } else { 0.0 };
+        let mut coarse = self.through(&self.coarse, rays, &depth, &sample, noise(&sample, DENSITY), first);
         let mut fine = self.fine.as_ref().map(|field| {
             let more = Axis::new("fine", self.train.fine_samples);
             let merged = Axis::new("merged", sample.size() + more.size());
             let drawn = fine_depths(&coarse.weights, &sample, &more, near, far, spread);
             let depth = merge_depths(&depth, &sample, &drawn, &more, &merged);
-            self.through(field, rays, &depth, &merged, noise(&merged, FINE_DENSITY))
+            self.through(field, rays, &depth, &merged, noise(&merged, FINE_DENSITY), least)
         });
         if self.train.ndc {
             for seen in [Some(&mut coarse), fine.as_mut()].into_iter().flatten() {
@@ -134,11 +139,12 @@ impl Rendering {
         depth: &Tensor,
         sample: &Axis,
         noise: Option<Tensor>,
+        least: f64,
     ) -> Composite {
         let length = rays.length();
         let unit = &rays.direction / length.max(&Tensor::scalar(1e-12));
         let found = field.at(&rays.at(depth), &unit, &progress(), noise.as_ref());
-        let mut seen = composite(&found.color, &found.density, depth, &length, sample);
+        let mut seen = composite_above(least, &found.color, &found.density, depth, &length, sample);
         if self.train.opaque_background {
             // White, as the images were composited on.
             seen.color = seen.color + (1.0 - &seen.opacity);

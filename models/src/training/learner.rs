@@ -2,7 +2,7 @@
 
 use super::optimise::{Rates, STEP};
 use crate::Error;
-use crate::config::{Optim, Settings};
+use crate::config::{Networks, Optim, Settings};
 use crate::data::initial_values;
 use crate::run::checkpoint::{Checkpoint, Saved};
 use raygrad_compiler::functions::mlp::Parameter;
@@ -11,10 +11,19 @@ use raygrad_compiler::{Channels, Program, Shape, Step, compile};
 use raygrad_runtime::{Device, InputInfo, ProgramId, Session};
 use std::collections::BTreeMap;
 
+/// Which forms programs are compiled to.
+#[derive(Clone, Copy)]
+struct Forms {
+    networks: Networks,
+    /// Where there is a choice, what is faster.
+    by_time: bool,
+}
+
 /// Programs that share parameters, and how far training has got.
 pub struct Learner {
     pub session: Session,
     device: Device,
+    forms: Forms,
     optim: Optim,
     inputs: BTreeMap<String, InputInfo>,
     step: usize,
@@ -23,23 +32,42 @@ pub struct Learner {
 }
 
 impl Learner {
-    /// Compiles a training step for a device, with `run.autotune` for the tiles that run it fastest there.
+    /// Compiles a training step for a device, with `run.autotune` for the tiles, and each program for the form of its networks,
+    /// that are fastest there.
     pub fn new(device: Device, settings: &Settings, step: &Step) -> Result<(Learner, ProgramId), Error> {
         let device = match settings.run.autotune {
             true => device.clone().tuned(&compile(step, &device.target())?)?,
             false => device,
         };
         let (session, optim) = (Session::new(device.clone())?, settings.optim.clone());
-        let mut learner = Learner { session, device, optim, inputs: BTreeMap::new(), step: 0, stepped: false };
+        let forms = Forms { networks: settings.run.networks, by_time: settings.run.autotune };
+        let mut learner = Learner { session, device, forms, optim, inputs: BTreeMap::new(), step: 0, stepped: false };
         let program = learner.add(step)?;
         Ok((learner, program))
     }
 
     /// Compiles one more program.
     pub fn add(&mut self, step: &Step) -> Result<ProgramId, Error> {
-        let program = self.session.add(compile(step, &self.device.target())?)?;
+        let program = self.session.add(self.compile(step)?)?;
         self.inputs = self.session.inputs().map(|(name, info)| (name.to_string(), info.clone())).collect();
         Ok(program)
+    }
+
+    fn compile(&self, step: &Step) -> Result<Program, Error> {
+        let layered = self.device.target();
+        let resident = layered.with_resident(step);
+        let targets = match self.forms {
+            Forms { networks: Networks::Resident, .. } => vec![resident],
+            Forms { networks: Networks::Auto, by_time: true } if resident != layered => vec![layered, resident],
+            _ => vec![layered],
+        };
+        let mut programs = vec![];
+        for target in targets {
+            programs.push(compile(step, &target)?);
+        }
+        // Where no network is narrow there is no choice.
+        programs.dedup_by_key(|p| p.to_string());
+        Ok(self.device.fastest(programs)?)
     }
 
     pub fn steps_done(&self) -> usize {

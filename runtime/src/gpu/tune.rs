@@ -1,4 +1,4 @@
-//! Which tiles run a program fastest, by running it.
+//! Which tiles, or which of several programs, run a step fastest, by running it.
 
 use super::cache::CacheFile;
 use crate::{Device, Forms, RunError, Session};
@@ -11,48 +11,66 @@ const KEPT: usize = 512;
 /// Runs of a choice that are timed, after one that is not; the fastest counts.
 const ROUNDS: usize = 5;
 
+/// The device with the tiles that run a program fastest.
 pub(crate) fn tuned(device: Device, program: &Program) -> Result<Device, RunError> {
     tuned_with(device, program, || CacheFile::open("tuned"))
 }
 
+/// The number of the fastest of several programs.
+pub(crate) fn fastest(device: &Device, programs: &[Program]) -> Result<usize, RunError> {
+    chosen(&key(device, programs), programs.len(), |i| seconds(device, &programs[i]), || CacheFile::open("tuned"))
+}
+
 fn tuned_with(device: Device, program: &Program, open: impl Fn() -> (CacheFile, Vec<u8>)) -> Result<Device, RunError> {
-    let key = key(&device, program);
     let forms = device.forms();
-    if let Some(tiles) = choices(&open().1).into_iter().find(|c| c.0 == key).map(|c| c.1) {
-        return Ok(device.with_forms(Forms { tiles, ..forms }));
+    let with = |tiles: usize| device.clone().with_forms(Forms { tiles: tiles as u32, ..forms });
+    // The key of a device whose tiles are not chosen.
+    let key = key(&with(0), std::slice::from_ref(program));
+    Ok(with(chosen(&key, TILES as usize, |tiles| seconds(&with(tiles), program), open)?))
+}
+
+/// Which of so many choices takes the least seconds, or took when it was asked before.
+fn chosen(
+    key: &str,
+    count: usize,
+    seconds: impl Fn(usize) -> Result<f64, RunError>,
+    open: impl Fn() -> (CacheFile, Vec<u8>),
+) -> Result<usize, RunError> {
+    if let Some(known) = choices(&open().1).into_iter().find(|c| c.0 == *key && c.1 < count) {
+        return Ok(known.1);
     }
     let mut best = (f64::INFINITY, 0);
-    for tiles in 0..TILES {
-        let seconds = seconds(&device.clone().with_forms(Forms { tiles, ..forms }), program)?;
+    for choice in 0..count {
+        let seconds = seconds(choice)?;
         if seconds < best.0 {
-            best = (seconds, tiles);
+            best = (seconds, choice);
         }
     }
     // Others may have added theirs in the meantime.
     let (file, held) = open();
     let mut all = choices(&held);
-    all.retain(|c| c.0 != key);
-    all.push((key, best.1));
+    all.retain(|c| c.0 != *key);
+    all.push((key.to_string(), best.1));
     let first = all.len().saturating_sub(KEPT);
-    let lines: String = all[first..].iter().map(|(key, tiles)| format!("{key} {tiles}\n")).collect();
+    let lines: String = all[first..].iter().map(|(key, choice)| format!("{key} {choice}\n")).collect();
     file.save(lines.as_bytes());
-    Ok(device.with_forms(Forms { tiles: best.1, ..forms }))
+    Ok(best.1)
 }
 
 /// Lines of a key and a choice.
-fn choices(held: &[u8]) -> Vec<(String, u32)> {
+fn choices(held: &[u8]) -> Vec<(String, usize)> {
     let one = |line: &str| {
-        let (key, tiles) = line.split_once(' ')?;
-        Some((key.to_string(), tiles.parse().ok().filter(|t| *t < TILES)?))
+        let (key, choice) = line.split_once(' ')?;
+        Some((key.to_string(), choice.parse().ok()?))
     };
     String::from_utf8_lossy(held).lines().filter_map(one).collect()
 }
 
-/// A hash of all that the choice depends on.
-fn key(device: &Device, program: &Program) -> String {
+/// A hash of all that a choice depends on.
+fn key(device: &Device, programs: &[Program]) -> String {
     // The backends describe an adapter's driver in different words.
-    let (version, half) = (env!("CARGO_PKG_VERSION"), device.half());
-    let all = format!("{version}\n{:?}\n{half:?}\n{program}", device.adapter());
+    let mut all = format!("{}\n{:?}\n{:?}\n", env!("CARGO_PKG_VERSION"), device.adapter(), device.forms());
+    programs.iter().for_each(|p| all += &p.to_string());
     blake3::hash(all.as_bytes()).to_hex().to_string()
 }
 
@@ -96,12 +114,32 @@ mod tests {
         let open = || CacheFile::at(Some(path.clone()));
         let first = tuned_with(device.clone(), &program(256), open).unwrap().forms();
         let held = choices(&open().1);
-        assert_eq!(held, [(key(&device, &program(256)), first.tiles)]);
+        let key = |rows: usize| key(&device.clone().with_forms(Forms::default()), &[program(rows)]);
+        assert_eq!(held, [(key(256), first.tiles as usize)]);
         // What is kept is believed.
         let other = (first.tiles + 1) % TILES;
-        open().0.save(format!("{} {other}\nnonsense\n{} 99\n", held[0].0, key(&device, &program(128))).as_bytes());
+        open().0.save(format!("{} {other}\nnonsense\n{} 99\n", held[0].0, key(128)).as_bytes());
         assert_eq!(tuned_with(device.clone(), &program(256), open).unwrap().forms().tiles, other);
         tuned_with(device.clone(), &program(128), open).unwrap();
-        assert_eq!(choices(&open().1).len(), 2);
+        let made = choices(&open().1);
+        assert_eq!(made.iter().map(|c| c.0.clone()).collect::<Vec<_>>(), [key(256), key(128)]);
+    }
+
+    /// The program that takes less time is chosen, and once.
+    #[test]
+    fn the_fastest_is_kept() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tuned.bin");
+        let open = || CacheFile::at(Some(path.clone()));
+        let asked = std::cell::Cell::new(0);
+        let choose = |times: [f64; 3]| {
+            let seconds = |i: usize| {
+                asked.set(asked.get() + 1);
+                Ok(times[i])
+            };
+            chosen("key", 3, seconds, open).unwrap()
+        };
+        assert_eq!((choose([3.0, 1.0, 2.0]), asked.get()), (1, 3));
+        assert_eq!((choose([1.0, 3.0, 2.0]), asked.get()), (1, 3));
     }
 }

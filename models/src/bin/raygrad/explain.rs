@@ -3,6 +3,7 @@
 use crate::{Choice, output_folder, print};
 use clap::{Args, ValueEnum};
 use raygrad::Experiment;
+use raygrad::config::Networks;
 use raygrad::planar::{PlanarData, PlanarModel};
 use raygrad::radiance::data::SpaceDataError;
 use raygrad::radiance::{RadianceModel, SpaceData};
@@ -55,8 +56,11 @@ pub fn run(args: &ExplainArgs) -> anyhow::Result<ExitCode> {
     let experiment = args.choice.experiment()?;
     experiment.layered.validate().map_err(raygrad::Error::from)?;
     let gpu = args.target == TargetChoice::Gpu || matches!(args.emit, Some(Artefact::Wgsl | Artefact::Spirv));
-    let target = if gpu { Target::gpu() } else { Target::cpu() };
+    let mut target = if gpu { Target::gpu() } else { Target::cpu() };
     let (step, recorded) = record(&experiment, target.kind)?;
+    if experiment.layered.settings.run.networks == Networks::Resident {
+        target = target.with_resident(&step);
+    }
     let program = compile(&step, &target).map_err(raygrad::Error::from)?;
     let files = match args.emit {
         None => vec![("explain.txt".to_string(), program.to_string().into_bytes())],

@@ -87,7 +87,7 @@ struct Choice {
     /// `f32`, or `mixed`: matrix products of halves, f16 on GPUs that have it and bf16 on the CPU.
     #[arg(long, value_name = "PRECISION")]
     precision: Option<String>,
-    /// On GPUs, first try which tiles run a step fastest. What is found is kept, so that later runs begin at once.
+    /// On GPUs, first try which tiles and forms of networks are fastest. What is found is kept, so that later runs begin at once.
     #[arg(long)]
     autotune: bool,
 }
