@@ -12,8 +12,8 @@ use raygrad_compiler::ops::pick::concat;
 use raygrad_compiler::reference::{Array, Bindings, evaluate};
 use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Step, compile};
-use raygrad_kernels::gpu::Half;
-use raygrad_runtime::{Device, Precision, ProgramId, Session};
+use raygrad_kernels::gpu::{Half, Limits};
+use raygrad_runtime::{Device, Forms, Precision, ProgramId, Session};
 use raygrad_tests::backend::compare;
 use raygrad_tests::{Rng, seed, total};
 
@@ -409,19 +409,18 @@ fn two_programs_share_their_inputs(device: &Device) {
     assert_eq!(session.get("x").unwrap(), [4.0; 20]);
 }
 
-/// The same adapter as if it could bind 48 KiB at once.
-fn narrow(device: &Device) -> Device {
-    let limit = 48 << 10;
+/// The same adapter as if it could do no more.
+fn within(device: &Device, most: Limits) -> Device {
     match device {
         Device::Cpu { .. } => device.clone(),
         #[cfg(feature = "wgpu")]
         Device::Wgpu { .. } => {
-            let gpu = raygrad_runtime::wgpu::Gpu::open(None).unwrap().with_max_binding(limit);
+            let gpu = raygrad_runtime::wgpu::Gpu::open(None).unwrap().within(most);
             Device::Wgpu { gpu: gpu.into(), forms: device.forms() }
         }
         #[cfg(feature = "vulkan")]
         Device::Vulkan { .. } => {
-            let gpu = raygrad_runtime::vulkan::Gpu::open(None).unwrap().with_max_binding(limit);
+            let gpu = raygrad_runtime::vulkan::Gpu::open(None).unwrap().within(most);
             Device::Vulkan { gpu: gpu.into(), forms: device.forms() }
         }
     }
@@ -429,7 +428,7 @@ fn narrow(device: &Device) -> Device {
 
 /// Inputs, temporaries, scratch memory and outputs of several parts, in every kind of kernel.
 fn buffers_beyond_the_binding_limit(device: &Device) {
-    let device = &narrow(device);
+    let device = &within(device, Limits { max_binding: 48 << 10, ..Limits::default() });
     layer(device, 2, 320, 24, 40, false);
     let (frame, row, slot) = (Axis::new("frame", 3), Axis::new("row", 3000), Axis::new("slot", 32));
     let x = Tensor::parameter("x", Shape::new(&[&frame, &row], 4));
@@ -453,6 +452,37 @@ fn buffers_beyond_the_binding_limit(device: &Device) {
     session.run(id).unwrap();
     session.run(id).unwrap();
     assert!(session.get("x").unwrap() == values.iter().map(|v| 4.0 * v).collect::<Vec<_>>());
+}
+
+/// Networks whose rows stay in a workgroup: where all they keep fits, where some of it or nothing does, and of halves in memory.
+fn networks_in_workgroups(device: &Device) {
+    let device = device.clone().with_forms(Forms { resident: 128, ..device.forms() });
+    // Whole tiles, and ragged ones that do not even end with four rows.
+    for (rows, own, sizes) in [(128, false, &[16 << 10][..]), (203, true, &[48 << 10, 3 << 10, 256])] {
+        let (frame, row) = (Axis::new("frame", 2), Axis::new("row", rows));
+        let p = |name: &str, axes: &[&Axis], size: (usize, usize)| Tensor::parameter(name, Shape::new(axes, size));
+        let frames = [&frame];
+        let x = Tensor::parameter("x", Shape::new(&[&frame, &row], 17));
+        let (a, b) = (p("a", &[], (17, 24)), p("b", if own { &frames } else { &[] }, (24, 36)));
+        let (c, d) = (p("c", &[], (53, 20)), p("d", &[], (20, 2)));
+        let bias = Tensor::parameter("bias", Shape::new(&[], 24));
+        let first = ((&x * 0.3).linear(&(&a * 0.1)) + &bias).relu();
+        let second = first.linear(&b).sin();
+        let y = concat([&second, &x]).linear(&(&c * 0.1)).softplus(1.0).linear(&d);
+        let loss = (&y * &y).mean_all();
+        let parameters = [&x, &a, &b, &c, &d, &bias];
+        let gradients = grad(&loss, &parameters);
+        let named = ["dx", "da", "db", "dc", "dd", "dbias"].into_iter().zip(gradients);
+        let outputs: Outputs = [("y", y), ("loss", loss)].into_iter().chain(named).collect();
+        for bytes in sizes {
+            let most = Limits { max_workgroup_bytes: *bytes, max_binding: u64::MAX, ..Limits::default() };
+            check(&within(&device, most), outputs.clone(), 3e-5, &format!("{rows} rows in {bytes} bytes"));
+        }
+        if own && device.has_half().is_some() {
+            let halves = device.clone().with_half(Some(Half { matrices: None }));
+            check(&halves, outputs, 1e-2, &format!("{rows} rows of halves"));
+        }
+    }
 }
 
 /// Every test on the best adapter of every backend.
@@ -485,6 +515,7 @@ on_every_backend!(
     training_follows_the_reference_and_repeats_bit_by_bit,
     two_programs_share_their_inputs,
     buffers_beyond_the_binding_limit,
+    networks_in_workgroups,
 );
 
 /// The same with tiles for drivers in software, which the tests above leave to users of such drivers.

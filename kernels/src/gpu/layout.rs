@@ -42,6 +42,17 @@ pub const TILES: u32 = 4;
 pub const SOFTWARE_TILES: u32 = TILES - 1;
 
 impl Limits {
+    /// The lower of each of two limits, with everything else as it is.
+    pub fn within(self, most: Limits) -> Limits {
+        Limits {
+            max_binding: self.max_binding.min(most.max_binding),
+            max_buffers: self.max_buffers.min(most.max_buffers),
+            max_workgroups: self.max_workgroups.min(most.max_workgroups),
+            max_workgroup_bytes: self.max_workgroup_bytes.min(most.max_workgroup_bytes),
+            ..self
+        }
+    }
+
     /// Cooperative matrices for tiles; those of drivers in software have none.
     pub(super) fn matrices(&self) -> Option<Matrices> {
         self.half.and_then(|h| h.matrices).filter(|_| self.tiles != SOFTWARE_TILES)

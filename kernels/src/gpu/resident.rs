@@ -283,14 +283,9 @@ impl Network {
         if whole { values.side_by_side(&self.rows) } else { values }
     }
 
-    /// Puts a channel of one row, or of four, where it is kept and written.
-    pub fn put(&self, e: &mut Emit, id: InstId, channel: Value, first: First, own: Value, value: Value) {
-        if let Some(place) = self.kept(id) {
-            self.set(e, place, channel, first, own, value);
-        }
-        for buffer in self.written(id) {
-            self.set(e, buffer, channel, first, own, value);
-        }
+    /// Buffers where a value is kept and written.
+    fn buffers(&self, id: InstId) -> Vec<BufferId> {
+        self.kept(id).into_iter().chain(self.written(id)).collect()
     }
 
     /// Where a value is kept.
@@ -307,30 +302,49 @@ impl Network {
         self.phases.region.stores.iter().filter_map(written).collect()
     }
 
-    /// Sets a channel of one row of a buffer, or of four neighbours.
-    pub fn set(&self, e: &mut Emit, buffer: BufferId, channel: Value, first: First, own: Value, value: Value) {
-        let axes = e.layout.shape(buffer).axes.clone();
-        let held = axes == self.tile_rows;
-        let count = if value.vector { 4 } else { 1 };
-        let floats = e.layout.shape(buffer).dtype == DType::F32;
+    /// Sets channels of a row of buffers, or where values are vectors, of four neighbours: each of a buffer, a channel and a value.
+    pub fn set(&self, e: &mut Emit, all: &[(BufferId, Value, Value)], first: First, own: Value) {
         let row = e.b.add(first.row, own);
-        let end = (!held && self.is_ragged()).then(|| self.rows.elements() as u32);
-        if value.vector && floats && (held || self.in_fours() && is_run(&axes, &self.rows)) {
-            return e.if_below(row, end, |e| {
-                let element = self.at(first.batch, row, own).element(e, &axes);
-                let at = e.index(buffer, channel, element);
-                e.store_four(buffer, at, value);
-            });
+        let (mut inside, mut fours, mut lanes) = (vec![], vec![], vec![]);
+        for item in all {
+            let shape = e.layout.shape(item.0);
+            let floats = shape.dtype == DType::F32;
+            if shape.axes == self.tile_rows {
+                inside.push(*item);
+            } else if item.2.vector && floats && self.in_fours() && is_run(&shape.axes, &self.rows) {
+                fours.push(*item);
+            } else {
+                lanes.push(*item);
+            }
         }
-        for i in 0..count {
+        self.set_at(e, &inside, first, (row, own));
+        let end = self.is_ragged().then(|| self.rows.elements() as u32);
+        if !fours.is_empty() {
+            e.if_below(row, end, |e| self.set_at(e, &fours, first, (row, own)));
+        }
+        // A branch a row, not one a channel.
+        let vectors = lanes.iter().any(|l| l.2.vector);
+        for i in 0..if vectors { 4 } else { 1 } {
+            if lanes.is_empty() {
+                break;
+            }
             let offset = e.b.u(i);
             let (row, own) = (e.b.add(row, offset), e.b.add(own, offset));
             e.if_below(row, end, |e| {
-                let element = self.at(first.batch, row, own).element(e, &axes);
-                let at = e.index(buffer, channel, element);
-                let lane = if value.vector { e.b.component(value, i) } else { value };
-                e.store(buffer, at, lane);
+                for (buffer, channel, value) in &lanes {
+                    let lane = if value.vector { e.b.component(*value, i) } else { *value };
+                    self.set_at(e, &[(*buffer, *channel, lane)], first, (row, own));
+                }
             });
+        }
+    }
+
+    fn set_at(&self, e: &mut Emit, all: &[(BufferId, Value, Value)], first: First, (row, own): (Value, Value)) {
+        for (buffer, channel, value) in all {
+            let axes = e.layout.shape(*buffer).axes.clone();
+            let element = self.at(first.batch, row, own).element(e, &axes);
+            let at = e.index(*buffer, *channel, element);
+            if value.vector { e.store_four(*buffer, at, *value) } else { e.store(*buffer, at, *value) }
         }
     }
 
@@ -340,12 +354,14 @@ impl Network {
         e.if_below(own, Some(self.tile), |e| {
             let position = self.position(e, first, own);
             let mut values = Values::new(region, vec![position]);
+            let mut all = vec![];
             for id in ids {
                 for (c, value) in values.all(e, *id).into_iter().enumerate() {
                     let c = e.b.u(c as u32);
-                    self.put(e, *id, c, first, own, value);
+                    all.extend(self.buffers(*id).into_iter().map(|buffer| (buffer, c, value)));
                 }
             }
+            self.set(e, &all, first, own);
         });
     }
 
@@ -379,7 +395,8 @@ impl Network {
             };
             let value = values.channel(e, id, Channel::Var(channel));
             let value = if fours { e.b.splat(value) } else { value };
-            self.put(e, id, channel, first, own, value);
+            let all: Vec<_> = self.buffers(id).into_iter().map(|buffer| (buffer, channel, value)).collect();
+            self.set(e, &all, first, own);
         });
         e.b.close_loop();
     }
@@ -395,7 +412,8 @@ impl Network {
             let own = e.b.open_loop("own_row", none, all, 1);
             let before = e.b.get(*sum);
             let term = self.held(e, term, channel, first, own);
-            self.put(e, id, channel, first, own, before);
+            let all: Vec<_> = self.buffers(id).into_iter().map(|buffer| (buffer, channel, before)).collect();
+            self.set(e, &all, first, own);
             let after = e.b.add(before, term);
             e.b.set(*sum, after);
             e.b.close_loop();

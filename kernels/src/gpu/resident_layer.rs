@@ -73,6 +73,7 @@ impl Layer<'_> {
         e.if_below(begin, busy, |e| {
             self.sum_up(e, row, column, &sums);
             let mut values = self.network.four(e, region, self.first, row);
+            let mut written = vec![];
             for (j, sum) in sums.iter().enumerate() {
                 let offset = e.b.u(j as u32);
                 let column = e.b.add(column, offset);
@@ -85,25 +86,25 @@ impl Layer<'_> {
                     all.push((*id, e.b.splat(value)));
                 }
                 for (id, value) in all {
-                    for buffer in self.network.written(id) {
-                        self.network.set(e, buffer, column, self.first, row, value);
-                    }
+                    written.extend(self.network.written(id).into_iter().map(|buffer| (buffer, column, value)));
                     if let Some(i) = kept.iter().position(|k| *k == id) {
                         e.b.set(waiting[i][j], value);
                     }
                 }
             }
+            self.network.set(e, &written, self.first, row);
         });
         e.b.barrier();
         e.if_below(begin, busy, |e| {
+            let mut all = vec![];
             for (id, vars) in kept.iter().zip(&waiting) {
-                let Some(place) = self.network.kept(*id) else { continue };
                 for (j, var) in vars.iter().enumerate() {
                     let offset = e.b.u(j as u32);
                     let (column, value) = (e.b.add(column, offset), e.b.get(*var));
-                    self.network.set(e, place, column, self.first, row, value);
+                    all.extend(self.network.kept(*id).map(|place| (place, column, value)));
                 }
             }
+            self.network.set(e, &all, self.first, row);
         });
     }
 

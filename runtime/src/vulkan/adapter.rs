@@ -152,10 +152,9 @@ impl Gpu {
         }
     }
 
-    /// The same device as if a kernel could bind no more than so many bytes of a buffer at once: larger buffers then lie in
-    /// parts.
-    pub fn with_max_binding(mut self, bytes: u64) -> Gpu {
-        self.limits.max_binding = self.limits.max_binding.min(bytes);
+    /// The same device as if it could do no more than `most`: larger buffers then lie in parts, for instance.
+    pub fn within(mut self, most: Limits) -> Gpu {
+        self.limits = self.limits.within(most);
         self
     }
 
