@@ -4,9 +4,9 @@
 //! `RAYGRAD_NIGHTLY=1` runs 10 000 of the large ones, `RAYGRAD_GRAPHS=first..end` those of some seeds. A failure prints the smallest
 //! recipe found that still fails.
 
+use raygrad_compiler::plan::region::RegionOp;
 #[cfg(feature = "gpu")]
 use raygrad_compiler::plan::region::{Grain, Region};
-use raygrad_compiler::plan::region::RegionOp;
 use raygrad_compiler::{Program, StepError, Target, compile};
 use raygrad_runtime::Device;
 use raygrad_tests::backend::{devices_for_large_programs, nightly, vulkan, wgpu};
@@ -138,11 +138,14 @@ fn small_graphs_through_vulkan() {
 fn networks_in_workgroups() {
     let target = Target { resident: MOST, ..Target::gpu() };
     let has_some = |recipe: fn(u64) -> Recipe, seed: u64| {
-        let resident = |r: &Region| r.grain == Grain::Tile && r.body.iter().any(|i| matches!(i.op, RegionOp::Linear(_)));
+        let resident =
+            |r: &Region| r.grain == Grain::Tile && r.body.iter().any(|i| matches!(i.op, RegionOp::Linear(_)));
         compile(&recipe(seed).build().step, &target).is_ok_and(|p| p.launches.iter().any(|l| resident(&l.region)))
     };
     let devices: Vec<Device> = raygrad_tests::backend::resident(MOST).into_iter().take(1).collect();
-    for (recipe, count) in [(Recipe::small as fn(u64) -> Recipe, SMALL), (Recipe::new, if nightly() { 600 } else { 60 })] {
+    for (recipe, count) in
+        [(Recipe::small as fn(u64) -> Recipe, SMALL), (Recipe::new, if nightly() { 600 } else { 60 })]
+    {
         let found: Vec<u64> = (0..count).filter(|s| has_some(recipe, *s)).collect();
         assert!(found.len() as u64 >= count / 20, "{} of {count} graphs", found.len());
         check_graphs(&devices, recipe, found.into_iter());

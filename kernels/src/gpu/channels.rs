@@ -131,6 +131,11 @@ pub(super) fn affine(bits: &[u32]) -> Option<(u32, u32)> {
 
 /// Per value of a region, whether "channel c" can be computed for a c known only when the kernel runs.
 pub(super) fn indexable(region: &Region) -> Vec<bool> {
+    indexable_from(region, |_| false)
+}
+
+/// The same where some values are held, so that any channel of them can be had.
+pub(super) fn indexable_from(region: &Region, held: impl Fn(InstId) -> bool) -> Vec<bool> {
     let mut all: Vec<bool> = vec![];
     for inst in &region.body {
         let own = match &inst.op {
@@ -145,7 +150,7 @@ pub(super) fn indexable(region: &Region) -> Vec<bool> {
             }
             _ => true,
         };
-        all.push(own && (inst.channels == 1 || inst.inputs.iter().all(|i| all[i.0 as usize])));
+        all.push(own && (inst.channels == 1 || inst.inputs.iter().all(|i| held(*i) || all[i.0 as usize])));
     }
     all
 }

@@ -3,9 +3,9 @@
 //! Kept are the inputs of layers, what leaves a layer's epilogue, scans with what they sum up, neighbours, and narrow values that
 //! several phases would compute again. Everything else is computed where it is needed.
 
-use super::channels::indexable;
+use super::channels::{indexable, indexable_from};
 use super::elements::{lane_costs, own_cost};
-use raygrad_compiler::plan::region::{BufferId, Inst, InstId, Region, RegionOp, Store};
+use raygrad_compiler::plan::region::{Inst, InstId, Region, RegionOp, Store};
 use raygrad_compiler::scalar::DType;
 use std::collections::{BTreeSet, HashMap};
 
@@ -143,6 +143,15 @@ fn copied(body: &mut Vec<Inst>, id: InstId, copies: &mut HashMap<InstId, InstId>
     copy
 }
 
+/// What a value is computed from where it is needed: itself, but for integers such as masks, which nothing keeps, their operands.
+fn sources(region: &Region, id: InstId) -> Vec<InstId> {
+    let inst = region.inst(id);
+    match inst.op {
+        RegionOp::Map(_) if inst.dtype == DType::U32 => inst.inputs.iter().flat_map(|i| sources(region, *i)).collect(),
+        _ => vec![id],
+    }
+}
+
 /// Per value, the layer whose sums it follows from channel by channel. What else it is computed from does not depend on that
 /// layer.
 fn homes(region: &Region) -> Vec<Option<InstId>> {
@@ -158,11 +167,11 @@ fn homes(region: &Region) -> Vec<Option<InstId>> {
         }
         let layer = inst.inputs.iter().filter_map(|i| last[i.0 as usize]).max();
         let follows = |i: &InstId| homes[i.0 as usize] == layer && region.inst(*i).channels == inst.channels;
-        let beside = |i: &InstId| {
+        let available = |i: &InstId| {
             let other = region.inst(*i);
-            let available = is_at_hand(other) && can_index[i.0 as usize] || other.dtype == DType::F32;
-            last[i.0 as usize] != layer && available
+            is_at_hand(other) && can_index[i.0 as usize] || other.dtype == DType::F32
         };
+        let beside = |i: &InstId| last[i.0 as usize] != layer && sources(region, *i).iter().all(available);
         let home = layer.filter(|_| {
             matches!(inst.op, RegionOp::Map(_))
                 && inst.inputs.iter().any(follows)
@@ -177,9 +186,11 @@ fn homes(region: &Region) -> Vec<Option<InstId>> {
 /// What phases keep in any case.
 fn kept(region: &Region, homes: &[Option<InstId>]) -> Vec<bool> {
     let mut kept = vec![false; region.body.len()];
-    let costs = lane_costs(region);
-    let is_cheap =
-        |id: InstId| is_at_hand(region.inst(id)) || costs[id.0 as usize] <= CHEAP && indexable(region)[id.0 as usize];
+    let (costs, can_index) = (lane_costs(region), indexable(region));
+    let is_cheap = |id: InstId| {
+        let at = id.0 as usize;
+        is_at_hand(region.inst(id)) || costs[at] <= CHEAP && can_index[at]
+    };
     for (at, inst) in region.body.iter().enumerate() {
         match inst.op {
             RegionOp::Linear(_) => kept[inst.inputs[0].0 as usize] = true,
@@ -191,8 +202,9 @@ fn kept(region: &Region, homes: &[Option<InstId>]) -> Vec<bool> {
             _ => {}
         }
         if homes[at].is_some() && !matches!(inst.op, RegionOp::Linear(_)) {
-            let beside = |i: &&InstId| homes[i.0 as usize] != homes[at] && !is_cheap(**i);
-            inst.inputs.iter().filter(beside).for_each(|i| kept[i.0 as usize] = true);
+            for i in inst.inputs.iter().filter(|i| homes[i.0 as usize] != homes[at]) {
+                sources(region, *i).into_iter().filter(|s| !is_cheap(*s)).for_each(|s| kept[s.0 as usize] = true);
+            }
         }
     }
     for store in &region.stores {
@@ -258,15 +270,7 @@ fn reads(region: &Region, kept: &[bool], phase: &Phase) -> BTreeSet<InstId> {
 /// The phases in order: each after those whose results it reads.
 fn order(region: &Region, homes: &[Option<InstId>], kept: &[bool]) -> Vec<Phase> {
     let written = |id: InstId| region.stores.iter().any(|s| matches!(s, Store::Write { value, .. } if *value == id));
-    let mut opened = region.clone();
-    for (at, inst) in opened.body.iter_mut().enumerate().filter(|(at, _)| kept[*at]) {
-        let own = &region.body[at];
-        // Its own operands decide whether a channel of it can be chosen, what is kept of others can be in any case.
-        if matches!(own.op, RegionOp::CumSum { .. } | RegionOp::Shift { .. } | RegionOp::SymEig { .. }) {
-            *inst = Inst { op: RegionOp::Load(BufferId(u32::MAX)), inputs: vec![], ..own.clone() };
-        }
-    }
-    let can_index = indexable(&opened);
+    let can_index = indexable_from(region, |id| kept[id.0 as usize]);
     let mut phases: Vec<Phase> = vec![];
     for id in region.ids().filter(|id| kept[id.0 as usize] || written(*id)) {
         let (at, inst) = (id.0 as usize, region.inst(id));
