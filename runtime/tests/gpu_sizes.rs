@@ -466,9 +466,9 @@ fn networks_in_workgroups(device: &Device) {
         let (a, b) = (p("a", &[], (17, 24)), p("b", if own { &frames } else { &[] }, (24, 36)));
         let (c, d) = (p("c", &[], (53, 20)), p("d", &[], (20, 2)));
         let bias = Tensor::parameter("bias", Shape::new(&[], 24));
-        let first = ((&x * 0.3).linear(&(&a * 0.1)) + &bias).relu();
+        let first = (x.linear(&a) * 0.1 + &bias).relu();
         let second = first.linear(&b).sin();
-        let y = concat([&second, &x]).linear(&(&c * 0.1)).softplus(1.0).linear(&d);
+        let y = (concat([&second, &x]).linear(&c) * 0.1).softplus(1.0).linear(&d);
         let loss = (&y * &y).mean_all();
         let parameters = [&x, &a, &b, &c, &d, &bias];
         let gradients = grad(&loss, &parameters);

@@ -41,9 +41,17 @@ fn networks(program: &Program, limits: &Limits) -> Vec<Kernel> {
 }
 
 fn on_gpus(step: &Step, bindings: &Bindings) {
+    on(&resident(MOST), step, bindings);
+}
+
+/// The same where a software driver takes half a minute to compile the kernels, which are the same for both.
+fn on_one_gpu(step: &Step, bindings: &Bindings) {
+    on(resident(MOST).get(..1).unwrap_or_default(), step, bindings);
+}
+
+fn on(devices: &[Device], step: &Step, bindings: &Bindings) {
     step.check().unwrap_or_else(|e| panic!("{e}"));
-    let devices: Vec<Device> = resident(MOST);
-    check(&devices, step, bindings).unwrap_or_else(|e| panic!("{e}"));
+    check(devices, step, bindings).unwrap_or_else(|e| panic!("{e}"));
 }
 
 /// A network on `[frame, row]` with a layer that reads the encoding again.
@@ -107,9 +115,9 @@ fn a_network_is_one_kernel() {
 
 #[test]
 fn gradients() {
-    for (rows, widths, own) in [(40, [64, 64, 64], false), (77, [128, 96, 33], false), (12, [17, 5, 8], true)] {
+    for (rows, widths, own) in [(64, [40, 36, 20], false), (77, [72, 20, 33], true)] {
         let network = Network::new((2, rows), widths, own);
-        on_gpus(&network.gradients(), &network.bindings);
+        on_one_gpu(&network.gradients(), &network.bindings);
     }
 }
 
@@ -118,9 +126,7 @@ const RAYS: Sizes = Sizes { frames: 2, rays: 3, samples: 8, width: 17, hidden: A
 /// Rendered rays: from the encoding to the sums along a ray in one kernel.
 #[test]
 fn a_ray_is_rendered_by_one_kernel() {
-    for sizes in
-        [RAYS, Sizes { samples: 70, width: 64, ..RAYS }, Sizes { samples: 100, width: 128, warped: false, ..RAYS }]
-    {
+    for sizes in [RAYS, Sizes { samples: 70, width: 40, warped: false, ..RAYS }] {
         let scene = Rendering::new(sizes);
         let values = [("rgb", &scene.rgb), ("depth", &scene.depth), ("opacity", &scene.opacity)];
         let step = Step { outputs: values.map(|(n, t)| (n.to_string(), t.clone())).into(), updates: vec![] };
@@ -135,7 +141,7 @@ fn a_ray_is_rendered_by_one_kernel() {
 #[test]
 fn a_step_of_rendering() {
     let scene = Rendering::new(Sizes { samples: 20, ..RAYS });
-    on_gpus(&scene.step(), &scene.bindings);
+    on_one_gpu(&scene.step(), &scene.bindings);
 }
 
 /// Rays of which some meet something opaque, at given depths.

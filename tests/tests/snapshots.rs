@@ -64,7 +64,9 @@ fn plans_do_not_depend_on_what_was_recorded_before() {
 mod wgsl {
     use super::{Planar, snapshot};
     use raygrad_compiler::autodiff::grad;
+    use raygrad_compiler::functions::composite::composite_above;
     use raygrad_compiler::graph::{Axis, Shape, Tensor};
+    use raygrad_compiler::ops::pick::concat;
     use raygrad_compiler::{Step, Target, compile};
     use raygrad_kernels::gpu::{Half, Inputs, Limits, Matrices, SOFTWARE_TILES, lower};
     use raygrad_tests::forms::forms;
@@ -75,7 +77,11 @@ mod wgsl {
     }
 
     fn kernels_within(step: &Step, limits: &Limits) -> String {
-        let program = compile(step, &Target::gpu()).unwrap_or_else(|e| panic!("{e}"));
+        kernels_of(step, &Target::gpu(), limits)
+    }
+
+    fn kernels_of(step: &Step, target: &Target, limits: &Limits) -> String {
+        let program = compile(step, target).unwrap_or_else(|e| panic!("{e}"));
         let lowered = lower(&program, &mut Inputs::default(), limits).unwrap_or_else(|e| panic!("{e}"));
         let kernels = lowered.launches.iter().flat_map(|l| &l.kernels);
         let text = kernels.map(|k| {
@@ -110,6 +116,26 @@ mod wgsl {
             snapshot(&format!("wgsl-{name}"), &kernels_within(&step, &limits));
         }
         snapshot("wgsl-software", &kernels_within(&step, &Limits { tiles: SOFTWARE_TILES, ..Limits::default() }));
+    }
+
+    /// A network that stays in a workgroup, and one that follows rays until they are dark.
+    #[test]
+    fn kernels_of_resident_networks() {
+        let p = |name: &str, rows: usize, columns: usize| Tensor::parameter(name, Shape::new(&[], (rows, columns)));
+        let (ray, sample) = (Axis::new("ray", 300), Axis::new("sample", 100));
+        let depth = Tensor::data("depth", Shape::new(&[&ray, &sample], 1));
+        let x = concat([&depth.sin(), &depth.cos()]);
+        let hidden = x.linear(&p("a", 2, 24)).relu();
+        let y = concat([&hidden, &x]).linear(&p("b", 26, 4));
+        let one = Tensor::scalar(1.0);
+        let seen = composite_above(1e-3, &y.slice(1..4).sigmoid(), &y.ch(0).softplus(1.0), &depth, &one, &sample);
+        for (name, output) in [("network", y), ("ray", seen.color)] {
+            let step = Step { outputs: vec![("y".into(), output)], updates: vec![] };
+            let target = Target::gpu().with_resident(&step);
+            snapshot(&format!("plan-{name}"), &super::plan(&step, &target));
+            let limits = Limits { max_binding: u64::MAX, ..Limits::default() };
+            snapshot(&format!("wgsl-{name}"), &kernels_of(&step, &target, &limits));
+        }
     }
 
     #[test]

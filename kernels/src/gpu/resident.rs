@@ -23,6 +23,8 @@ use std::collections::HashMap;
 
 /// Rows of a tile, largest first.
 const ROWS: [u32; 3] = [64, 32, 16];
+/// Rows that a tile's reading of the weights is worth.
+const READING: u32 = 8;
 /// Invocations a row.
 pub(super) const PER_ROW: u32 = 4;
 /// Lines from which workgroups that follow one each fill a device ...
@@ -88,13 +90,17 @@ struct Tile {
     lanes: u32,
 }
 
-/// The largest tile whose values a workgroup can hold; or the smallest, with those that fit.
+/// The tile that takes the least work for so many rows, of those whose values a workgroup can hold; or the smallest, with those
+/// that fit. Where a line may be left, tiles divide it.
 fn tile_of(phases: &Phases, rows: u32, bytes: u32) -> Tile {
-    let useful = |r: &u32| *r == ROWS[ROWS.len() - 1] || r / 2 < rows;
+    let smallest = ROWS[ROWS.len() - 1];
+    let most = if vanishing(&phases.region).is_some() { smallest.max(rows / 3) } else { u32::MAX };
     let kept = phases.kept.iter().filter(|k| **k).count();
-    let tiles: Vec<Tile> = ROWS.into_iter().filter(useful).map(|rows| place(phases, rows, bytes / 4)).collect();
-    let whole = tiles.iter().position(|t| t.offsets.len() == kept).unwrap_or(tiles.len() - 1);
-    tiles.into_iter().nth(whole).unwrap_or_else(|| unreachable!("the smallest tile is always there"))
+    let tiles = ROWS.into_iter().filter(|r| *r <= most).map(|r| place(phases, r, bytes / 4));
+    // Every tile reads all weights once, which costs as much as some rows more.
+    let work = |t: &Tile| rows.div_ceil(t.rows) * (t.rows + READING);
+    let whole = tiles.filter(|t| t.offsets.len() == kept).min_by_key(work);
+    whole.unwrap_or_else(|| place(phases, smallest, bytes / 4))
 }
 
 /// Places for what is kept, first come, first served.
