@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # This machine's GPU: first every form of kernel against the f64 reference, then training steps at the papers' sizes, f32,
 # through wgpu and Vulkan, against PyTorch on the same GPU (where RAYGRAD_PYTHON has one with CUDA) and against what the device
-# does at best. Writes benches/results/<device>.md.
+# does at best; then narrow networks layer by layer against in workgroups. Writes benches/results/<device>.md.
 #
 # usage: benches/gpu.sh [PEERS] [--rounds N] [--scale S] [--devices wgpu,vulkan]
 #        PEERS: folder of the peers' scripts, by default benches/peers; S: a share of the papers' sizes, for slow devices

@@ -63,6 +63,10 @@ const WORKS: [Work; 2] = [
     },
 ];
 
+/// Steps of narrow networks, which a GPU runs layer by layer or in a workgroup each.
+const NARROW: [&str; 3] = ["l2g-small", "nerf-small", "planar-inn-small"];
+const NETWORKS: [&str; 2] = ["layered", "resident"];
+
 /// How PyTorch runs.
 const PEERS: [(&str, &[&str]); 5] = [
     ("PyTorch f32", &[]),
@@ -125,6 +129,7 @@ fn main() -> anyhow::Result<()> {
         device = own.values().flatten().last().map(|b| b.device.clone()).context("no device was asked for")?;
         report(&mut text, work, &own, &others)?;
     }
+    args.narrow(&mut text)?;
     let words: Vec<&str> = device.split(|c: char| !c.is_ascii_alphanumeric()).filter(|w| !w.is_empty()).collect();
     let file = args.out.join(format!("{}.md", words.join("-")));
     let head = format!("# {device}\n\n`benches/gpu.sh --rounds {} --scale {}`, medians.\n", args.rounds, args.scale);
@@ -139,13 +144,16 @@ impl Args {
     /// `None` where the device lacks the precision.
     fn own(&self, work: &Work, device: &str, precision: &str) -> anyhow::Result<Option<Bench>> {
         let rows = if quick() { 64.0 } else { (work.rows * self.scale).round() };
-        let mut command = self.programs.bench(work.preset);
-        command.args(["--launches", "--device", device, "--precision", precision]);
-        command.args(["--set", &format!("{}={rows}", work.setting)]);
+        self.bench(work.preset, device, precision, &["--set", &format!("{}={rows}", work.setting)])
+    }
+
+    fn bench(&self, preset: &str, device: &str, precision: &str, options: &[&str]) -> anyhow::Result<Option<Bench>> {
+        let mut command = self.programs.bench(preset);
+        command.args(["--launches", "--device", device, "--precision", precision]).args(options);
         if quick() {
             command.args(["--steps", "1", "--set", "field.layers=[16,16]"]);
             command.args(["--set", "warp.layers=[16,16]", "--set", "warp.skip=[]"]);
-            if work.preset == "l2g-blender" {
+            if !preset.starts_with("planar") {
                 command.args(["--set", "scene.image_size=[16,16]", "--set", "scene.train_views=4"]);
                 command.args(["--set", "radiance.skip=[]", "--set", "train.samples=8"]);
             }
@@ -154,6 +162,41 @@ impl Args {
             Err(e) if format!("{e:#}").contains("no half precision") => Ok(None),
             found => Ok(Some(serde_json::from_str(&found?)?)),
         }
+    }
+
+    /// Steps of narrow networks in both forms, alternating.
+    fn narrow(&self, text: &mut String) -> anyhow::Result<()> {
+        writeln!(text, "\n## Narrow networks, ms a step\n")?;
+        let mut table = Table::new(&["preset", "device", "layered", "launches", "resident", "launches", "ratio"]);
+        for preset in NARROW {
+            for (device, precision) in self.devices.iter().flat_map(|d| self.precisions.iter().map(move |p| (d, p))) {
+                let mut runs: [Vec<Bench>; 2] = Default::default();
+                for round in 1..=self.rounds {
+                    for (form, runs) in NETWORKS.iter().zip(&mut runs) {
+                        let set = format!("run.networks={form}");
+                        let Some(bench) = self.bench(preset, device, precision, &["--set", &set])? else { continue };
+                        eprintln!(
+                            "round {round}: {preset}, {form}, on {device}, {precision} {:.4} s",
+                            bench.seconds_per_step
+                        );
+                        runs.push(bench);
+                    }
+                }
+                let seconds = |runs: &[Bench]| median(&runs.iter().map(|b| b.seconds_per_step).collect::<Vec<_>>());
+                let [Some(a), Some(b)] = [runs[0].last(), runs[1].last()] else { continue };
+                let (layered, resident) = (seconds(&runs[0]), seconds(&runs[1]));
+                table.row([
+                    preset.into(),
+                    format!("{device}, {precision}"),
+                    format!("{:.2}", 1e3 * layered),
+                    a.launches.to_string(),
+                    format!("{:.2}", 1e3 * resident),
+                    b.launches.to_string(),
+                    format!("{:.2}", layered / resident),
+                ]);
+            }
+        }
+        Ok(write!(text, "{table}")?)
     }
 
     /// Seconds of a step in PyTorch, on as many points of a patch, or rays.

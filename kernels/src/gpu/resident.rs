@@ -191,6 +191,7 @@ impl Network {
             });
             e.b.barrier();
             let seen = e.b.load_uniform(seen, first);
+            e.b.name(seen, "seen_now");
             let enough = e.b.less(zero, seen);
             e.b.break_if(enough);
         }

@@ -114,9 +114,11 @@ impl Layer<'_> {
         let w = self.weights;
         let terms = (if w.transposed { w.columns } else { w.rows }) as u32;
         let (none, whole) = (e.b.u(0), e.b.u(terms / STEP * STEP));
-        let k = e.b.open_loop("term", none, whole, STEP);
-        self.stage(e, (row, column), k, STEP, sums);
-        e.b.close_loop();
+        if terms >= STEP {
+            let k = e.b.open_loop("term", none, whole, STEP);
+            self.stage(e, (row, column), k, STEP, sums);
+            e.b.close_loop();
+        }
         if !terms.is_multiple_of(STEP) {
             self.stage(e, (row, column), whole, terms % STEP, sums);
         }
