@@ -147,6 +147,8 @@ fn a_step_of_rendering() {
 /// Rays of which some meet something opaque, at given depths.
 struct Rays {
     seen: Composite,
+    /// What the network gives.
+    y: Tensor,
     bindings: Bindings,
     depths: Axis,
 }
@@ -169,7 +171,7 @@ impl Rays {
         let depths = (0..SAMPLES).map(|i| 0.05 * i as f64).collect();
         bindings.insert("depth".into(), Array::floats(depth.shape(), depths));
         bindings.insert("thick".into(), Array::floats(thick.shape(), vec![9.0, 0.01, 30.0, 0.4, 3.0, 0.0]));
-        Rays { seen, bindings, depths: sample }
+        Rays { seen, y, bindings, depths: sample }
     }
 
     fn step(&self) -> Step {
@@ -199,6 +201,12 @@ fn rays_end_where_they_are_dark() {
     with_weights.outputs.push(("weights".into(), rays.seen.weights.clone()));
     assert!(!leaves_rays(&with_weights));
     on_gpus(&with_weights, &rays.bindings);
+    // What is no count may fall again.
+    let falls = rays.y.ch(1).cumsum(&rays.depths);
+    let weights = Tensor::scalar(0.0).less_than(&falls).select(&Tensor::scalar(0.0), &rays.y.ch(2).exp());
+    let not_counted = Step { outputs: vec![("sum".into(), weights.sum(&[&rays.depths]))], updates: vec![] };
+    assert!(!leaves_rays(&not_counted));
+    on_gpus(&not_counted, &rays.bindings);
 }
 
 /// Samples that nothing can be computed from do not matter where they are left out, and only there.

@@ -3,8 +3,9 @@
 //! A layer of a wide network is a launch of its own: its weights alone fill what a workgroup can hold. The rows of a narrow one
 //! pass through all layers in workgroup memory, and only what comes out of the last one, or what a way back needs, is written.
 //!
-//! Where nothing goes back, a scan along the inner axis and the sums over it need no cut either: a workgroup follows a whole
-//! line, such as a ray. Else scans, and what follows from them up to the next layer, are regions of their own.
+//! Where no scan along the inner axis goes backwards, as in rendering without gradients, scans and the sums over that axis need no cut
+//! either: a workgroup follows a whole line, such as a ray. Else scans, and what follows from them up to the next layer, are
+//! regions of their own.
 
 use super::cuts::{Cuts, Info};
 use crate::graph::{Axes, Tensor, topological};
@@ -85,43 +86,31 @@ fn is_layer(t: &Tensor) -> bool {
     matches!(t.op().form(), Form::Linear { .. })
 }
 
-/// Whether a workgroup can follow a line of `domain` from its first element to the last, and it pays: sums along it go
-/// forwards, and no layer waits for what is known at its end.
+/// Whether a workgroup can follow the lines of `domain` from the first element to the last, and it pays: all sums along them go
+/// forwards, and neighbours can be computed again.
 fn follows_lines(all: &[Tensor], domain: &Axes) -> bool {
     let Some(inner) = domain.last() else { return false };
     let outer = domain.without(inner);
-    // What depends on a layer of the domain, and on a sum along its lines.
-    let (mut of_layers, mut of_sums): (HashSet<u64>, HashSet<u64>) = Default::default();
+    // What depends on a layer or a scan of the domain.
+    let mut kept: HashSet<u64> = HashSet::new();
     let mut pays = false;
     for t in all {
         let here = t.axes() == domain;
         let over = t.inputs().iter().any(|i| i.axes() == domain);
-        let after = |set: &HashSet<u64>| t.inputs().iter().any(|i| set.contains(&i.id()));
-        let (mut layer, mut sum) = (after(&of_layers), after(&of_sums));
+        let mut depends = t.inputs().iter().any(|i| kept.contains(&i.id()));
         match t.op().form() {
-            Form::Linear { .. } if here => {
-                if sum {
-                    return false;
-                }
-                layer = true;
-            }
+            Form::Linear { .. } if here => depends = true,
             Form::CumSum { axis, reverse } if here => {
                 if reverse || axis != *inner || t.width() > LINE_CHANNELS {
                     return false;
                 }
-                (sum, pays) = (true, true);
+                (depends, pays) = (true, true);
             }
-            // Neighbours are computed again.
-            Form::Shift { axis, .. } if here && (layer || sum || axis != *inner) => return false,
-            Form::Reduce(_) if over => {
-                sum = true;
-                pays |= *t.axes() == outer && t.width() <= LINE_CHANNELS;
-            }
-            Form::Outer | Form::Scatter { .. } if over => sum = true,
+            Form::Shift { axis, .. } if here && (depends || axis != *inner) => return false,
+            Form::Reduce(_) if over => pays |= *t.axes() == outer && t.width() <= LINE_CHANNELS,
             _ => {}
         }
-        of_layers.extend(layer.then_some(t.id()));
-        of_sums.extend(sum.then_some(t.id()));
+        kept.extend(depends.then_some(t.id()));
     }
     pays
 }
