@@ -9,7 +9,7 @@
 //! | `parts`, `stages` | a region cut into what one kind of kernel does, and long work into stages |
 //! | `elements`, `reduce`, `chunks`, `scatter`, `scan`, `layer`, `outer` | the kinds of kernels |
 //! | `tile`, `direct`, `sums`, `give`, `epilogue` | matrix products in tiles, and what is done with their sums |
-//! | `resident`, `phases`, `resident_layer`, `vanish` | whole narrow networks in a workgroup's memory |
+//! | `resident`, `phases`, `room`, `resident_layer`, `resident_line`, `vanish` | whole narrow networks in a workgroup's memory |
 //! | `peak` | kernels that measure a device |
 
 mod builder;
@@ -33,6 +33,8 @@ mod phases;
 mod reduce;
 mod resident;
 mod resident_layer;
+mod resident_line;
+mod room;
 mod scalar;
 mod scan;
 mod scatter;

@@ -6,25 +6,22 @@
 //! What is kept lies `[channel][row]`, values whose lives do not overlap in the same place. What does not fit, even of the
 //! smallest tiles, lies in scratch memory.
 
-use super::builder::{Kind, Value, Var};
+use super::builder::{Kind, Value};
 use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
 use super::memory::{Emit, Position, is_run};
 use super::phases::{Phase, Phases};
-use super::reduce::{combine, neutral};
 use super::resident_layer;
+use super::resident_line::Carried;
+use super::room::tile_of;
 use super::vanish::vanishing;
 use super::{Kernel, LowerError};
 use naga::MathFunction as Math;
 use raygrad_compiler::graph::{Axes, Axis, Shape};
-use raygrad_compiler::plan::region::{BufferId, Inst, InstId, Region, RegionOp, Store};
+use raygrad_compiler::plan::region::{BufferId, Grain, Inst, InstId, Region, RegionOp, Store};
 use raygrad_compiler::scalar::DType;
 use std::collections::HashMap;
 
-/// Rows of a tile, largest first.
-const ROWS: [u32; 3] = [64, 32, 16];
-/// Rows that a tile's reading of the weights is worth.
-const READING: u32 = 8;
 /// Invocations a row.
 pub(super) const PER_ROW: u32 = 4;
 /// Lines from which workgroups that follow one each fill a device ...
@@ -32,12 +29,11 @@ const MANY_LINES: usize = 256;
 /// ... and elements of a line up to which it does not take too long.
 const LONG_LINE: usize = 1024;
 /// Most channels that are combined over a line: one an invocation of the smallest tile.
-const LINE_CHANNELS: usize = 32;
+pub(super) const LINE_CHANNELS: usize = 32;
 
 /// Whether a region is for a kernel of this kind.
 pub(super) fn is_resident(region: &Region) -> bool {
-    region.grain == raygrad_compiler::plan::region::Grain::Tile
-        && region.body.iter().any(|i| matches!(i.op, RegionOp::Linear(_)))
+    region.grain == Grain::Tile && region.body.iter().any(|i| matches!(i.op, RegionOp::Linear(_)))
 }
 
 /// Whether workgroups follow lines, and a store is a combination over one.
@@ -83,53 +79,6 @@ pub(super) fn kernel(layout: &mut Layout, limits: Limits, name: &str, region: &R
     network.kernel(layout, limits, name)
 }
 
-struct Tile {
-    rows: u32,
-    /// Lane of the workgroup's memory where a value begins; of those that it holds.
-    offsets: HashMap<InstId, u32>,
-    lanes: u32,
-}
-
-/// The tile that takes the least work for so many rows, of those whose values a workgroup can hold; or the smallest, with those
-/// that fit. Where a line may be left, tiles divide it.
-fn tile_of(phases: &Phases, rows: u32, bytes: u32) -> Tile {
-    let smallest = ROWS[ROWS.len() - 1];
-    let most = if vanishing(&phases.region).is_some() { smallest.max(rows / 3) } else { u32::MAX };
-    let kept = phases.kept.iter().filter(|k| **k).count();
-    let tiles = ROWS.into_iter().filter(|r| *r <= most).map(|r| place(phases, r, bytes / 4));
-    // Every tile reads all weights once, which costs as much as some rows more.
-    let work = |t: &Tile| rows.div_ceil(t.rows) * (t.rows + READING);
-    let whole = tiles.filter(|t| t.offsets.len() == kept).min_by_key(work);
-    whole.unwrap_or_else(|| place(phases, smallest, bytes / 4))
-}
-
-/// Places for what is kept, first come, first served.
-fn place(phases: &Phases, rows: u32, most: u32) -> Tile {
-    // A layer has read what it needs when it writes. Everything else writes as it reads.
-    let mut lives: Vec<(InstId, usize, usize)> = vec![];
-    for (at, phase) in phases.all.iter().enumerate() {
-        let from = 2 * at + usize::from(matches!(phase, Phase::Layer { .. }));
-        for id in phase.results().into_iter().filter(|id| phases.kept[id.0 as usize]) {
-            let last = (at..phases.all.len()).filter(|p| phases.reads(*p).contains(&id)).map(|p| 2 * p).max();
-            lives.push((id, from, last.unwrap_or(from).max(from)));
-        }
-    }
-    let mut taken: Vec<(u32, u32, usize, usize)> = vec![];
-    let mut offsets = HashMap::new();
-    for (id, from, to) in lives {
-        let lanes = phases.region.inst(id).channels as u32 * rows;
-        let mut beside: Vec<(u32, u32)> =
-            taken.iter().filter(|t| t.2 <= to && from <= t.3).map(|t| (t.0, t.1)).collect();
-        beside.sort();
-        let offset = beside.iter().fold(0, |at, (first, end)| if at + lanes <= *first { at } else { at.max(*end) });
-        if offset + lanes <= most {
-            taken.push((offset, offset + lanes, from, to));
-            offsets.insert(id, offset);
-        }
-    }
-    Tile { rows, offsets, lanes: taken.iter().map(|t| t.1).max().unwrap_or(0) }
-}
-
 pub(super) struct Network {
     pub phases: Phases,
     /// Where what is kept lies.
@@ -137,7 +86,7 @@ pub(super) struct Network {
     /// Axes of which a workgroup has one element.
     pub batch: Axes,
     /// Those along which its tiles run.
-    rows: Axes,
+    pub rows: Axes,
     /// That of what a workgroup holds.
     tile_rows: Axes,
     /// Rows of a tile.
@@ -151,12 +100,6 @@ pub(super) struct Network {
 pub(super) struct First {
     pub batch: Value,
     pub row: Value,
-}
-
-/// What an invocation carries along a line, a variable a channel that it has.
-struct Carried {
-    sums: Vec<(InstId, Var)>,
-    totals: Vec<(Store, Var)>,
 }
 
 impl Network {
@@ -174,7 +117,7 @@ impl Network {
         if !self.lines {
             let row = e.b.mul(own, size);
             e.b.name(row, "first_row");
-            self.tile(&mut e, First { batch, row }, &Carried { sums: vec![], totals: vec![] });
+            self.tile(&mut e, First { batch, row }, &Carried::default());
             return e.finish(name);
         }
         let carried = self.carried(&mut e);
@@ -198,20 +141,6 @@ impl Network {
         e.b.close_loop();
         self.finish(&mut e, First { batch, row: from }, &carried);
         e.finish(name)
-    }
-
-    fn carried(&self, e: &mut Emit) -> Carried {
-        let (zero, region) = (e.b.f(0.0), &self.phases.region);
-        let scans = self.phases.all.iter().filter_map(|p| if let Phase::Scan(id) = p { Some(*id) } else { None });
-        let sums = scans.map(|id| (id, e.b.var("before", zero))).collect();
-        let mut totals = vec![];
-        for store in &region.stores {
-            if let Store::Reduce { kind, .. } = store {
-                let first = neutral(&mut e.b, *kind);
-                totals.push((store.clone(), e.b.var("total", first)));
-            }
-        }
-        Carried { sums, totals }
     }
 
     /// All phases of one tile.
@@ -239,7 +168,7 @@ impl Network {
     }
 
     /// Rows of the last tile do not fill it.
-    fn is_ragged(&self) -> bool {
+    pub fn is_ragged(&self) -> bool {
         !(self.rows.elements() as u32).is_multiple_of(self.tile)
     }
 
@@ -291,7 +220,7 @@ impl Network {
     }
 
     /// Buffers where a value is kept and written.
-    fn buffers(&self, id: InstId) -> Vec<BufferId> {
+    pub fn buffers(&self, id: InstId) -> Vec<BufferId> {
         self.kept(id).into_iter().chain(self.written(id)).collect()
     }
 
@@ -408,27 +337,8 @@ impl Network {
         e.b.close_loop();
     }
 
-    /// An invocation a channel runs along the tile, with what it carries from the tiles before.
-    fn scan(&self, e: &mut Emit, id: InstId, first: First, carried: &Carried) {
-        let region = &self.phases.region;
-        let term = self.places[&region.inst(id).inputs[0]];
-        let Some((_, sum)) = carried.sums.iter().find(|s| s.0 == id) else { return };
-        e.if_below(e.invocation, Some(region.inst(id).channels as u32), |e| {
-            let channel = e.invocation;
-            let (none, all) = (e.b.u(0), e.b.u(self.tile));
-            let own = e.b.open_loop("own_row", none, all, 1);
-            let before = e.b.get(*sum);
-            let term = self.held(e, term, channel, first, own);
-            let all: Vec<_> = self.buffers(id).into_iter().map(|buffer| (buffer, channel, before)).collect();
-            self.set(e, &all, first, own);
-            let after = e.b.add(before, term);
-            e.b.set(*sum, after);
-            e.b.close_loop();
-        });
-    }
-
     /// A channel of a row of what is kept.
-    fn held(&self, e: &mut Emit, place: BufferId, channel: Value, first: First, own: Value) -> Value {
+    pub fn held(&self, e: &mut Emit, place: BufferId, channel: Value, first: First, own: Value) -> Value {
         let axes = e.layout.shape(place).axes.clone();
         let position = self.position(e, first, own);
         let element = position.element(e, &axes);
@@ -461,54 +371,5 @@ impl Network {
     /// A workgroup's element of axes that its tiles do not run along.
     pub fn batch_element(&self, e: &mut Emit, first: First, axes: &Axes) -> Value {
         Position::new(&self.batch, first.batch).element(e, axes)
-    }
-
-    /// An invocation a channel combines the rows of a tile.
-    fn totals(&self, e: &mut Emit, first: First, carried: &Carried) {
-        let mut before = 0;
-        for (store, total) in &carried.totals {
-            let Store::Reduce { kind, value, .. } = store else { continue };
-            let channels = self.phases.region.inst(*value).channels as u32;
-            self.own_channel(e, (before, channels), |e, channel| {
-                let (none, all) = (e.b.u(0), e.b.u(self.tile));
-                let mut end = all;
-                if self.is_ragged() {
-                    let count = e.b.u(self.rows.elements() as u32);
-                    let left = e.b.sub(count, first.row);
-                    end = e.b.math(Math::Min, &[all, left]);
-                }
-                let own = e.b.open_loop("own_row", none, end, 1);
-                let next = self.held(e, self.places[value], channel, first, own);
-                let so_far = e.b.get(*total);
-                let next = combine(&mut e.b, *kind, so_far, next);
-                e.b.set(*total, next);
-                e.b.close_loop();
-            });
-            before = (before + channels) % (PER_ROW * ROWS[ROWS.len() - 1] - LINE_CHANNELS as u32);
-        }
-    }
-
-    /// Writes what was combined over the line.
-    fn finish(&self, e: &mut Emit, first: First, carried: &Carried) {
-        let mut before = 0;
-        for (store, total) in &carried.totals {
-            let Store::Reduce { value, buffer, .. } = store else { continue };
-            let channels = self.phases.region.inst(*value).channels as u32;
-            self.own_channel(e, (before, channels), |e, channel| {
-                let axes = e.layout.shape(*buffer).axes.clone();
-                let element = self.batch_element(e, first, &axes);
-                let (at, value) = (e.index(*buffer, channel, element), e.b.get(*total));
-                e.store(*buffer, at, value);
-            });
-            before = (before + channels) % (PER_ROW * ROWS[ROWS.len() - 1] - LINE_CHANNELS as u32);
-        }
-    }
-
-    /// Does something in the invocations from `before` on that have one of so many channels each.
-    fn own_channel(&self, e: &mut Emit, (before, channels): (u32, u32), act: impl FnOnce(&mut Emit, Value)) {
-        let first = e.b.u(before);
-        // Invocations before the first one wrap around to large numbers.
-        let channel = e.b.sub(e.invocation, first);
-        e.if_below(channel, Some(channels), |e| act(e, channel));
     }
 }

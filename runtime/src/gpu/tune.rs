@@ -16,9 +16,13 @@ pub(crate) fn tuned(device: Device, program: &Program) -> Result<Device, RunErro
     tuned_with(device, program, || CacheFile::open("tuned"))
 }
 
-/// The number of the fastest of several programs.
+/// The number of the fastest of several programs, of those after the first that the device can run.
 pub(crate) fn fastest(device: &Device, programs: &[Program]) -> Result<usize, RunError> {
-    chosen(&key(device, programs), programs.len(), |i| seconds(device, &programs[i]), || CacheFile::open("tuned"))
+    let seconds = |i: usize| match seconds(device, &programs[i]) {
+        Err(_) if i > 0 => Ok(f64::INFINITY),
+        found => found,
+    };
+    chosen(&key(device, programs), programs.len(), seconds, || CacheFile::open("tuned"))
 }
 
 fn tuned_with(device: Device, program: &Program, open: impl Fn() -> (CacheFile, Vec<u8>)) -> Result<Device, RunError> {
