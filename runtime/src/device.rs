@@ -208,17 +208,15 @@ impl Device {
         }
     }
 
-    /// Of several programs for the same step, the one that this device runs fastest: found, and kept, as by [`Device::tuned`].
-    /// Results differ by rounding.
-    #[cfg_attr(not(feature = "gpu"), expect(unused_mut))]
-    pub fn fastest(&self, mut programs: Vec<Program>) -> Result<Program, RunError> {
+    /// Of two programs for the same step, the one that this device runs faster: found, and kept, as by [`Device::tuned`]. Results
+    /// differ by rounding. On the CPU, the first.
+    pub fn faster(&self, programs: [Program; 2]) -> Result<Program, RunError> {
         #[cfg(feature = "gpu")]
-        if programs.len() > 1 {
-            let best = crate::gpu::tune::fastest(self, &programs)?;
-            programs.swap(0, best);
-        }
-        let first = programs.into_iter().next();
-        first.ok_or_else(|| RunError::Device { device: self.name(), problem: "no program was given to choose".into() })
+        let best = if let Device::Cpu { .. } = self { 0 } else { crate::gpu::tune::faster(self, &programs)? };
+        #[cfg(not(feature = "gpu"))]
+        let best = 0;
+        let [first, second] = programs;
+        Ok(if best == 0 { first } else { second })
     }
 
     /// Bytes of a lane of each of a program's buffers, by id.

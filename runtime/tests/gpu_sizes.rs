@@ -479,7 +479,9 @@ fn networks_in_workgroups(device: &Device) {
             let most = Limits { max_workgroup_bytes: *bytes, max_binding: u64::MAX, ..Limits::default() };
             check(&within(&device, most), outputs.clone(), 3e-5, &format!("{rows} rows in {bytes} bytes"));
         }
-        if own && device.has_half().is_some() {
+        if device.has_half().is_none() {
+            println!("halves skipped: {} stores none", device.name());
+        } else if own {
             let halves = device.clone().with_half(Some(Half { matrices: None }));
             check(&halves, outputs, 1e-2, &format!("{rows} rows of halves"));
         }

@@ -1,6 +1,8 @@
 //! Networks that stay in a workgroup of a GPU: values and gradients against the reference, and what a launch holds.
 #![cfg(feature = "gpu")]
 
+use raygrad::config::{Layered, Networks};
+use raygrad::training::Learner;
 use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::functions::composite::{Composite, composite_above};
 use raygrad_compiler::functions::mlp::Activation;
@@ -12,7 +14,7 @@ use raygrad_compiler::reference::{Array, Bindings};
 use raygrad_compiler::{Program, Step, Target, compile};
 use raygrad_kernels::gpu::{GpuLaunch, Inputs, Kernel, Limits, lower};
 use raygrad_runtime::Device;
-use raygrad_tests::backend::{reference, resident, run};
+use raygrad_tests::backend::{gpus, reference, resident, run};
 use raygrad_tests::check::check;
 use raygrad_tests::rendering::{Rendering, Sizes};
 use raygrad_tests::{Rng, seed, total};
@@ -121,6 +123,25 @@ fn gradients() {
     }
 }
 
+/// What a run asks for, and that a CPU has no such forms.
+#[test]
+fn a_setting_decides() {
+    let network = Network::new((3, 64), [20, 20, 20], false);
+    let mut settings = Layered::load("planar-barf").unwrap_or_else(|e| panic!("{e}")).settings;
+    for (device, on_gpu) in
+        std::iter::once((Device::cpu(Some(1)).unwrap(), false)).chain(gpus().into_iter().map(|d| (d, true)))
+    {
+        for (networks, wanted) in [(Networks::Auto, false), (Networks::Layered, false), (Networks::Resident, true)] {
+            settings.run.networks = networks;
+            let (learner, program) =
+                Learner::new(device.clone(), &settings, &network.values()).unwrap_or_else(|e| panic!("{e}"));
+            let launches = &learner.program(program).launches;
+            let found = launches.iter().any(|l| l.region.grain == Grain::Tile);
+            assert_eq!(found, wanted && on_gpu, "{networks:?} on {}", device.name());
+        }
+    }
+}
+
 const RAYS: Sizes = Sizes { frames: 2, rays: 3, samples: 8, width: 17, hidden: Activation::Relu, warped: true };
 
 /// Rendered rays: from the encoding to the sums along a ray in one kernel.
@@ -136,6 +157,14 @@ fn a_ray_is_rendered_by_one_kernel() {
         assert_eq!(program.launches.iter().filter(|l| samples(&l.region)).count(), 1, "{program}");
         on_gpus(&step, &scene.bindings);
     }
+}
+
+#[test]
+fn second_derivatives() {
+    let scene = Rendering::new(Sizes { width: 9, hidden: Activation::Tanh, ..RAYS });
+    let (step, bindings) = scene.second_order();
+    assert!(!networks(&plan(&step), &Limits::default()).is_empty());
+    on_one_gpu(&step, &bindings);
 }
 
 #[test]

@@ -310,6 +310,7 @@ fn a_gpu_can_run_every_kind_of_field() {
 #[cfg(feature = "gpu")]
 #[test]
 fn views_in_workgroups() {
+    use raygrad_kernels::gpu::{Inputs, Kernel, Limits, lower};
     let dark: &[&str] = &["radiance.stop_below=0.3"];
     for (preset, set) in [("l2g-blender", dark), ("barf-llff", &[]), ("nerf-llff-repr", dark), ("garf-llff", dark)] {
         let model = model(preset, set);
@@ -322,6 +323,11 @@ fn views_in_workgroups() {
         };
         let fields = if preset == "nerf-llff-repr" { 2 } else { 1 };
         assert_eq!(program.launches.iter().filter(over_samples).count(), fields, "{preset}: {program}");
+        let lowered = lower(&program, &mut Inputs::default(), &Limits::default());
+        let lowered = lowered.unwrap_or_else(|e| panic!("{preset}: {e}"));
+        let text = |k: &Kernel| k.wgsl().unwrap_or_else(|e| panic!("{preset}: {e}"));
+        let leaves = |k: &Kernel| text(k).contains("workgroupUniformLoad");
+        assert_eq!(lowered.launches.iter().flat_map(|l| &l.kernels).any(leaves), set == dark, "{preset}");
         check(&devices, &view, &bound).unwrap_or_else(|e| panic!("{preset}: {e}"));
     }
 }

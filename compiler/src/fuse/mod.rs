@@ -22,6 +22,7 @@ mod resident;
 mod store;
 
 pub use build::{Fused, Origin, fuse};
+pub use resident::LINE_CHANNELS;
 
 use crate::step::Step;
 

@@ -16,7 +16,7 @@ use std::collections::{HashMap, HashSet};
 /// Inputs of a layer for one output that it may have.
 const INPUTS: usize = 2;
 /// Most channels of a scan, or of a sum over a line, that a workgroup follows: one an invocation.
-const LINE_CHANNELS: usize = 32;
+pub const LINE_CHANNELS: usize = 32;
 
 /// Domains of resident networks; whether a workgroup follows whole lines there.
 #[derive(Default)]
@@ -38,7 +38,7 @@ impl Resident {
         }
         let all = topological(roots.iter().cloned());
         let mut layers: HashMap<Axes, (usize, bool)> = HashMap::new();
-        for t in all.iter().filter(|t| is_layer(t)) {
+        for t in all.iter().filter(|t| matches!(t.op().form(), Form::Linear { .. })) {
             let (x, w) = (&t.inputs()[0], &t.inputs()[1]);
             let shared = t.axes().last().is_some_and(|inner| !w.axes().contains(inner));
             let narrow = t.width() <= most && x.width() <= INPUTS * most;
@@ -59,12 +59,9 @@ impl Resident {
     /// Of a node of a resident network, what it works on.
     pub fn grain(&self, info: &Info) -> Option<Grain> {
         let lines = *self.0.get(&info.domain)?;
-        let inside = info.runs_along(&info.domain)
-            && match &info.form {
-                Form::Outer | Form::Scatter { .. } => !info.reduces,
-                Form::Linear { .. } => info.shared_weights(),
-                _ => true,
-            };
+        // Products of many rows have kernels of their own.
+        let apart = info.reduces && matches!(info.form, Form::Outer | Form::Scatter { .. });
+        let inside = info.runs_along(&info.domain) && !apart;
         (inside && (lines || info.after != After::Scan)).then_some(Grain::Tile)
     }
 }
@@ -80,10 +77,6 @@ pub(super) fn after(cuts: &Cuts, info: &Info) -> After {
             inside.map(|o| o.after).max().unwrap_or(After::Neither)
         }
     }
-}
-
-fn is_layer(t: &Tensor) -> bool {
-    matches!(t.op().form(), Form::Linear { .. })
 }
 
 /// Whether a workgroup can follow the lines of `domain` from the first element to the last, and it pays: all sums along them go

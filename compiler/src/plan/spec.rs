@@ -1,6 +1,6 @@
 //! What a program may contain, checked after planning in debug builds and tests.
 
-use super::region::{RegionOp, Store};
+use super::region::{Grain, RegionOp, Store};
 use super::{BufferKind, Program};
 use crate::fuse::TargetKind;
 
@@ -44,7 +44,9 @@ fn verify(program: &Program) -> Result<(), String> {
                 RegionOp::Pick(pick) => pick.iter().all(|(o, c)| {
                     inst.inputs.get(*o as usize).is_some_and(|x| (*c as usize) < region.inst(*x).channels)
                 }),
-                RegionOp::CumSum { .. } | RegionOp::Shift { .. } => region.whole,
+                // A workgroup follows a line forwards.
+                RegionOp::CumSum { reverse } => region.whole && !(*reverse && region.grain == Grain::Tile),
+                RegionOp::Shift { .. } => region.whole,
                 RegionOp::RowReduce(_) => {
                     let channels = region.inst(inst.inputs[0]).channels;
                     let uniform = region.inner.as_ref().is_some_and(|a| !inst.axes.contains(a));

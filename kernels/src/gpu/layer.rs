@@ -3,7 +3,7 @@
 use super::builder::Value;
 use super::epilogue::{Finish, First, RowTotal, loads, totals};
 use super::layout::{Layout, Limits};
-use super::memory::{Emit, Position, is_run};
+use super::memory::{Emit, Position, four_rows, is_run};
 use super::parts::{empty, push_load};
 use super::tile::{Along, Operand, Tile, multiply, split};
 use super::{Kernel, LowerError, elements};
@@ -162,23 +162,8 @@ impl Layer<'_> {
 
     /// Four neighbouring rows, those past the end clamped to the last.
     pub fn positions(&self, e: &mut Emit, batch: Value, first: Value) -> Vec<Position> {
-        let clamped = !self.rows.is_multiple_of(self.tile.m);
-        let mut all = vec![];
-        let mut first = first;
-        if clamped && self.in_fours() {
-            let last = e.b.u(self.rows - 4);
-            first = e.b.math(Math::Min, &[first, last]);
-        }
-        for i in 0..4 {
-            let offset = e.b.u(i);
-            let mut row = e.b.add(first, offset);
-            if clamped && !self.in_fours() {
-                let last = e.b.u(self.rows - 1);
-                row = e.b.math(Math::Min, &[row, last]);
-            }
-            all.push(self.position(batch, row));
-        }
-        all
+        let rows = four_rows(e, first, self.rows, !self.rows.is_multiple_of(self.tile.m));
+        rows.into_iter().map(|row| self.position(batch, row)).collect()
     }
 
     fn position(&self, batch: Value, row: Value) -> Position {

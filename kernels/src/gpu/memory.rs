@@ -358,6 +358,26 @@ pub(super) fn is_run(axes: &Axes, rows: &Axes) -> bool {
     !rows.is_empty() && all.ends_with(&rows)
 }
 
+/// Four neighbouring rows of so many, from `first` on, a multiple of four. Where they may lie behind the end, they are the last four
+/// again, or if rows do not end with four, the last one.
+pub(super) fn four_rows(e: &mut Emit, first: Value, rows: u32, clamped: bool) -> [Value; 4] {
+    let in_fours = rows.is_multiple_of(4);
+    let mut first = first;
+    if clamped && in_fours {
+        let last = e.b.u(rows - 4);
+        first = e.b.math(naga::MathFunction::Min, &[first, last]);
+    }
+    [0, 1, 2, 3].map(|i| {
+        let offset = e.b.u(i);
+        let row = e.b.add(first, offset);
+        if !clamped || in_fours {
+            return row;
+        }
+        let last = e.b.u(rows - 1);
+        e.b.math(naga::MathFunction::Min, &[row, last])
+    })
+}
+
 /// Neighbouring axes out of those that `number` counts need one division and one remainder at most.
 fn run_of_axes(e: &mut Emit, own: &Axes, number: Value, axes: &Axes) -> Option<Value> {
     let all: Vec<&Axis> = own.iter().collect();

@@ -117,7 +117,9 @@ impl Split<'_, '_> {
             self.region.stores.clone().into_iter().partition(|s| matches!(s, Store::Write { .. }));
         self.region.stores = writes;
         let resident = resident::is_resident(&self.region);
-        if !self.region.whole && !resident {
+        // All values are written by one kernel, which also combines what it can over lines.
+        let together = self.region.whole || resident;
+        if !together {
             self.slice_concatenations(&others);
         }
         let homes = Homes::of(&self.region);
@@ -125,14 +127,12 @@ impl Split<'_, '_> {
         let mut recomputed: Vec<Store> = vec![];
         let mut reloaded: Vec<Store> = vec![];
         for store in others {
-            if resident {
-                let over_line = resident::is_over_line(self.layout, &self.region, &store);
-                if over_line { on_lines.push(store) } else { reloaded.push(store) }
-            } else if self.region.whole && self.is_along_lines(&store) {
+            let followed = |s: &Store| !resident || resident::follows(&self.region, s);
+            if together && self.is_along_lines(&store) && followed(&store) {
                 on_lines.push(store);
-            } else if !self.region.whole && self.is_layers_total(&homes, &store) {
+            } else if !together && self.is_layers_total(&homes, &store) {
                 in_layers.push(store);
-            } else if self.region.whole || self.must_reload(&store, &homes) {
+            } else if together || self.must_reload(&store, &homes) {
                 reloaded.push(store);
             } else {
                 recomputed.push(store);

@@ -9,7 +9,7 @@
 use super::builder::{Kind, Value};
 use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
-use super::memory::{Emit, Position, is_run};
+use super::memory::{Emit, Position, four_rows, is_run};
 use super::phases::{Phase, Phases};
 use super::resident_layer;
 use super::resident_line::Carried;
@@ -17,6 +17,7 @@ use super::room::tile_of;
 use super::vanish::vanishing;
 use super::{Kernel, LowerError};
 use naga::MathFunction as Math;
+use raygrad_compiler::fuse::LINE_CHANNELS;
 use raygrad_compiler::graph::{Axes, Axis, Shape};
 use raygrad_compiler::plan::region::{BufferId, Grain, Inst, InstId, Region, RegionOp, Store};
 use raygrad_compiler::scalar::DType;
@@ -28,20 +29,17 @@ pub(super) const PER_ROW: u32 = 4;
 const MANY_LINES: usize = 256;
 /// ... and elements of a line up to which it does not take too long.
 const LONG_LINE: usize = 1024;
-/// Most channels that are combined over a line: one an invocation of the smallest tile.
-pub(super) const LINE_CHANNELS: usize = 32;
 
 /// Whether a region is for a kernel of this kind.
 pub(super) fn is_resident(region: &Region) -> bool {
     region.grain == Grain::Tile && region.body.iter().any(|i| matches!(i.op, RegionOp::Linear(_)))
 }
 
-/// Whether workgroups follow lines, and a store is a combination over one.
-pub(super) fn is_over_line(layout: &Layout, region: &Region, store: &Store) -> bool {
-    let (Store::Reduce { value, buffer, .. }, Some(inner)) = (store, &region.inner) else { return false };
-    let outer = region.domain.without(inner);
-    let pays = region.whole || outer.elements() >= MANY_LINES && inner.size() <= LONG_LINE;
-    pays && layout.shape(*buffer).axes == outer && region.inst(*value).channels <= LINE_CHANNELS
+/// Whether a workgroup combines a reduction along lines itself.
+pub(super) fn follows(region: &Region, store: &Store) -> bool {
+    let lines = |inner: &Axis| region.domain.without(inner).elements() >= MANY_LINES && inner.size() <= LONG_LINE;
+    let narrow = store.values().iter().all(|v| region.inst(*v).channels <= LINE_CHANNELS);
+    narrow && (region.whole || region.inner.as_ref().is_some_and(lines))
 }
 
 /// The kernel of a region whose stores write, or are combined over lines.
@@ -59,7 +57,8 @@ pub(super) fn kernel(layout: &mut Layout, limits: Limits, name: &str, region: &R
         false => region.domain.minus(&region.domain.minus(&of_weights.fold(Axes::none(), |a, b| a.union(&b)))),
     };
     let rows = region.domain.minus(&batch);
-    let tile = tile_of(&phases, rows.elements() as u32, limits.max_workgroup_bytes);
+    let ends = vanishing(&phases.region);
+    let tile = tile_of(&phases, (rows.elements() as u32, ends.is_some()), limits.max_workgroup_bytes);
     let tile_rows = Axes::new([Axis::new("tile", tile.rows as usize)]);
     layout.hold(tile.lanes);
     let mut places = HashMap::new();
@@ -75,7 +74,7 @@ pub(super) fn kernel(layout: &mut Layout, limits: Limits, name: &str, region: &R
         places.insert(id, place);
     }
     let spilled = places.len() > tile.offsets.len();
-    let network = Network { phases, places, batch, rows, tile_rows, tile: tile.rows, lines, spilled };
+    let network = Network { phases, places, batch, rows, tile_rows, tile: tile.rows, lines, ends, spilled };
     network.kernel(layout, limits, name)
 }
 
@@ -92,6 +91,8 @@ pub(super) struct Network {
     /// Rows of a tile.
     pub tile: u32,
     lines: bool,
+    /// The count behind whose first element a line need not be followed.
+    ends: Option<InstId>,
     spilled: bool,
 }
 
@@ -121,7 +122,7 @@ impl Network {
             return e.finish(name);
         }
         let carried = self.carried(&mut e);
-        let stop = vanishing(&self.phases.region).map(|id| (id, e.b.workgroup("seen", Kind::F32, false, 1)));
+        let stop = self.ends.map(|id| (id, e.b.workgroup("seen", Kind::F32, false, 1)));
         let (from, to) = (e.b.u(0), e.b.u(count));
         let row = e.b.open_loop("row", from, to, self.tile);
         e.b.barrier();
@@ -195,28 +196,22 @@ impl Network {
         position.and(&self.tile_rows, own)
     }
 
-    /// Values at four neighbouring rows of a tile, from `own` on, a multiple of four.
+    /// Four neighbouring rows of a tile, from `own` on, a multiple of four.
+    fn four_rows(&self, e: &mut Emit, first: First, own: Value) -> [Value; 4] {
+        let row = e.b.add(first.row, own);
+        four_rows(e, row, self.rows.elements() as u32, self.is_ragged())
+    }
+
+    /// Values there.
     pub fn four<'r>(&self, e: &mut Emit, region: &'r Region, first: First, own: Value) -> Values<'r> {
         let mut all = vec![];
-        let whole = self.in_fours();
-        let mut row = e.b.add(first.row, own);
-        if whole && self.is_ragged() {
-            let last = e.b.u(self.rows.elements() as u32 - 4);
-            row = e.b.math(Math::Min, &[row, last]);
-        }
-        for i in 0..4 {
-            let offset = e.b.u(i);
+        for (i, row) in self.four_rows(e, first, own).into_iter().enumerate() {
+            let offset = e.b.u(i as u32);
             let own = e.b.add(own, offset);
-            all.push(match whole {
-                true => {
-                    let row = e.b.add(row, offset);
-                    self.at(first.batch, row, own)
-                }
-                false => self.position(e, first, own),
-            });
+            all.push(self.at(first.batch, row, own));
         }
         let values = Values::new(region, all).side_by_side(&self.tile_rows);
-        if whole { values.side_by_side(&self.rows) } else { values }
+        if self.in_fours() { values.side_by_side(&self.rows) } else { values }
     }
 
     /// Buffers where a value is kept and written.
@@ -358,11 +353,8 @@ impl Network {
             }
             return e.b.vector([all[0], all[1], all[2], all[3]]);
         }
-        let mut row = e.b.add(first.row, own);
-        if self.is_ragged() && axes != self.tile_rows {
-            let last = e.b.u(self.rows.elements() as u32 - 4);
-            row = e.b.math(Math::Min, &[row, last]);
-        }
+        // What the workgroup holds does not depend on where the tile begins.
+        let row = if axes == self.tile_rows { first.row } else { self.four_rows(e, first, own)[0] };
         let element = self.at(first.batch, row, own).element(e, &axes);
         let at = e.index(place, channel, element);
         e.load_four(place, at)

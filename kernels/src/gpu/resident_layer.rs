@@ -64,11 +64,9 @@ impl Layer<'_> {
         let sums: Vec<Var> = (0..self.own).map(|_| e.b.var("sum", zeros)).collect();
         let kept: Vec<InstId> = results.iter().copied().filter(|r| self.network.kept(*r).is_some()).collect();
         // What is kept waits until all have read: the first result where its sum was.
-        let mut waiting: Vec<Vec<Var>> = vec![];
-        for i in 0..kept.len() {
-            let own = |_| if i == 0 { None } else { Some(e.b.var("waiting", zeros)) };
-            let more: Vec<Option<Var>> = (0..self.own).map(own).collect();
-            waiting.push(more.into_iter().zip(&sums).map(|(v, sum)| v.unwrap_or(*sum)).collect());
+        let mut waiting = vec![sums.clone()];
+        for _ in 1..kept.len() {
+            waiting.push((0..self.own).map(|_| e.b.var("waiting", zeros)).collect());
         }
         e.if_below(begin, busy, |e| {
             self.sum_up(e, row, column, &sums);

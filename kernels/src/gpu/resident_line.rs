@@ -4,9 +4,10 @@ use super::builder::{Value, Var};
 use super::memory::Emit;
 use super::phases::Phase;
 use super::reduce::{combine, neutral};
-use super::resident::{First, LINE_CHANNELS, Network, PER_ROW};
+use super::resident::{First, Network, PER_ROW};
 use super::room::SMALLEST;
 use naga::MathFunction as Math;
+use raygrad_compiler::fuse::LINE_CHANNELS;
 use raygrad_compiler::plan::region::{InstId, Store};
 
 /// What an invocation carries along a line, a variable a channel that it has.

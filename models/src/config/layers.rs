@@ -302,6 +302,19 @@ mod tests {
     }
 
     #[test]
+    fn a_share_of_the_light_is_below_all_of_it() {
+        let mut l = Layered::load("nerf-small").unwrap();
+        let mut check = |value: &str| {
+            l.set(&format!("radiance.stop_below={value}")).unwrap();
+            l.validate().map_err(|e| e.to_string())
+        };
+        assert_eq!((check("0.0"), check("0.5")), (Ok(()), Ok(())));
+        for bad in ["1.0", "-0.1", "nan"] {
+            assert!(check(bad).unwrap_err().contains("`radiance.stop_below`: expected a share of the light"), "{bad}");
+        }
+    }
+
+    #[test]
     fn a_file_reports_its_lines() {
         let dir = tempfile::tempdir().unwrap();
         let write = |text: &str| {

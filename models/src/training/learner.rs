@@ -11,19 +11,13 @@ use raygrad_compiler::{Channels, Program, Shape, Step, compile};
 use raygrad_runtime::{Device, InputInfo, ProgramId, Session};
 use std::collections::BTreeMap;
 
-/// Which forms programs are compiled to.
-#[derive(Clone, Copy)]
-struct Forms {
-    networks: Networks,
-    /// Where there is a choice, what is faster.
-    by_time: bool,
-}
-
 /// Programs that share parameters, and how far training has got.
 pub struct Learner {
     pub session: Session,
     device: Device,
-    forms: Forms,
+    networks: Networks,
+    /// Of forms of networks, the fastest.
+    autotune: bool,
     optim: Optim,
     inputs: BTreeMap<String, InputInfo>,
     step: usize,
@@ -40,8 +34,9 @@ impl Learner {
             false => device,
         };
         let (session, optim) = (Session::new(device.clone())?, settings.optim.clone());
-        let forms = Forms { networks: settings.run.networks, by_time: settings.run.autotune };
-        let mut learner = Learner { session, device, forms, optim, inputs: BTreeMap::new(), step: 0, stepped: false };
+        let (networks, autotune) = (settings.run.networks, settings.run.autotune);
+        let inputs = BTreeMap::new();
+        let mut learner = Learner { session, device, networks, autotune, optim, inputs, step: 0, stepped: false };
         let program = learner.add(step)?;
         Ok((learner, program))
     }
@@ -54,20 +49,20 @@ impl Learner {
     }
 
     fn compile(&self, step: &Step) -> Result<Program, Error> {
-        let layered = self.device.target();
-        let resident = layered.with_resident(step);
-        let targets = match self.forms {
-            Forms { networks: Networks::Resident, .. } => vec![resident],
-            Forms { networks: Networks::Auto, by_time: true } if resident != layered => vec![layered, resident],
-            _ => vec![layered],
-        };
-        let mut programs = vec![];
-        for target in targets {
-            programs.push(compile(step, &target)?);
+        let target = self.device.target();
+        let resident = || compile(step, &target.with_resident(step));
+        if self.networks == Networks::Resident {
+            return Ok(resident()?);
         }
-        // Where no network is narrow there is no choice.
-        programs.dedup_by_key(|p| p.to_string());
-        Ok(self.device.fastest(programs)?)
+        let layered = compile(step, &target)?;
+        if self.networks == Networks::Auto && self.autotune {
+            let resident = resident()?;
+            // Where no network is narrow there is no choice.
+            if resident.to_string() != layered.to_string() {
+                return Ok(self.device.faster([layered, resident])?);
+            }
+        }
+        Ok(layered)
     }
 
     pub fn steps_done(&self) -> usize {

@@ -1,4 +1,4 @@
-//! Which tiles, or which of several programs, run a step fastest, by running it.
+//! Which tiles, or which of two programs, run a step fastest, by running it.
 
 use super::cache::CacheFile;
 use crate::{Device, Forms, RunError, Session};
@@ -16,8 +16,8 @@ pub(crate) fn tuned(device: Device, program: &Program) -> Result<Device, RunErro
     tuned_with(device, program, || CacheFile::open("tuned"))
 }
 
-/// The number of the fastest of several programs, of those after the first that the device can run.
-pub(crate) fn fastest(device: &Device, programs: &[Program]) -> Result<usize, RunError> {
+/// The number of the faster of two programs; the second may be one that the device cannot run.
+pub(crate) fn faster(device: &Device, programs: &[Program; 2]) -> Result<usize, RunError> {
     let seconds = |i: usize| match seconds(device, &programs[i]) {
         Err(_) if i > 0 => Ok(f64::INFINITY),
         found => found,
