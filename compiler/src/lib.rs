@@ -8,8 +8,9 @@
 //! | fuse | [`fuse`] | step -> regions and the cuts between them |
 //! | plan | [`plan`] | regions -> [`Program`] |
 //!
-//! [`reference`](mod@reference) evaluates any graph in f64 and is the oracle of all tests; [`scalar`] is what kernels see of pointwise ops.
+//! [`cost`] says what work takes on a device. [`reference`](mod@reference) evaluates any graph in f64 and is the oracle of all tests; [`scalar`] is what kernels see of pointwise ops.
 pub mod autodiff;
+pub mod cost;
 pub mod functions;
 pub mod fuse;
 pub mod graph;

@@ -2,7 +2,7 @@
 
 use super::cuts::{Cuts, Key, view};
 use super::reread::reread;
-use super::store::{Candidate, choose};
+use super::store::{Candidate, NEVER, choose};
 use super::{Target, TargetKind, merge};
 use crate::graph::{Axes, Shape, Tensor};
 use crate::ops::input::Input;
@@ -134,6 +134,8 @@ impl Builder {
     fn store_for(&mut self, key: &Key, ids: &BTreeSet<u64>) {
         let mut candidates: Vec<Candidate> = vec![];
         let mut needed = vec![];
+        // What the region reads in any case, and what it reads only to compute something again, with the channels.
+        let (mut read, mut readable) = (HashSet::new(), BTreeMap::new());
         let mut room = self.cuts.target.store_bytes;
         let mut seen: HashSet<u64> = ids.clone().into_iter().collect();
         let mut stack: Vec<u64> = ids.iter().copied().collect();
@@ -142,7 +144,20 @@ impl Builder {
             let earlier = self.cuts.nodes[&id].depth < key.depth;
             for (i, operand) in self.cuts.nodes[&id].operands.clone().into_iter().enumerate() {
                 let user = &self.cuts.nodes[&id];
-                if user.needs_buffer(i) || self.cuts.stored_for(user, i) || self.loads(&operand, key) {
+                if user.needs_buffer(i) {
+                    continue;
+                }
+                if self.cuts.stored_for(user, i) || self.loads(&operand, key) {
+                    if !earlier {
+                        read.insert(operand.id());
+                        continue;
+                    }
+                    let channels: &mut BTreeSet<u32> = readable.entry(operand.id()).or_default();
+                    match &user.form {
+                        Form::Pick(pick) => channels.extend(pick.iter().filter(|p| p.0 as usize == i).map(|p| p.1)),
+                        _ => channels.extend(0..operand.width() as u32),
+                    }
+                    operands.push(operand.id());
                     continue;
                 }
                 let info = self.cuts.get(&operand);
@@ -157,25 +172,35 @@ impl Builder {
                 }
             }
             if earlier {
-                let info = &self.cuts.nodes[&id];
-                let width = info.tensor.width();
-                let target = &self.cuts.target;
-                // A copy has no buffer of its own: what follows a stored reduction is computed again.
-                let costly = info.copy_of.is_none() && self.cuts.is_costly(info);
-                // Wide values are stored as long as there is room; over few elements they take none worth mentioning.
-                let bytes = 4 * info.tensor.shape().lanes();
-                let narrow = width <= target.store_channels || bytes <= target.store_free_bytes;
-                let expensive = costly && (narrow || bytes <= room);
-                if expensive && !narrow {
-                    room -= bytes;
-                }
-                candidates.push(Candidate { id, channels: width as u64, expensive, operands });
+                candidates.push(self.candidate(id, operands, &mut room));
             }
         }
-        for id in choose(&candidates, &needed) {
+        for (id, channels) in &readable {
+            let bytes = 4 * (self.cuts.nodes[id].tensor.axes().elements() * channels.len()) as u64;
+            let stored = if read.contains(id) { 0 } else { cost(self.cuts.target.seconds_of_bytes(bytes)) };
+            candidates.push(Candidate { id: *id, stored, again: NEVER, operands: vec![] });
+        }
+        for id in choose(&candidates, &needed).into_iter().filter(|id| !readable.contains_key(id)) {
             let tensor = self.cuts.nodes[&id].tensor.clone();
             self.store(&tensor);
         }
+    }
+
+    /// What storing a node takes, and what computing it again from its operands. `room` is what wide values may still take.
+    fn candidate(&self, id: u64, operands: Vec<u64>, room: &mut usize) -> Candidate {
+        let (info, target) = (&self.cuts.nodes[&id], &self.cuts.target);
+        let bytes = 4 * info.tensor.shape().lanes();
+        // Where nothing is stored yet there will be one more launch.
+        let launch = if self.work.contains_key(&info.key()) { 0.0 } else { target.seconds_of_start() };
+        let (stored, again) = (cost(launch + self.cuts.stored(info)), cost(self.cuts.again(info)));
+        // Wide values are stored as long as there is room; over few elements they take none worth mentioning.
+        let narrow = info.tensor.width() <= target.store_channels || bytes <= target.store_free_bytes;
+        // A copy has no buffer of its own: what follows a stored reduction is computed again.
+        let storable = info.copy_of.is_none() && (narrow || bytes <= *room);
+        if storable && !narrow && stored < again {
+            *room -= bytes;
+        }
+        Candidate { id, stored: if storable { stored } else { NEVER }, again, operands }
     }
 
     /// The region of `key` that stores `ids`, and the nodes it computes.
@@ -325,6 +350,11 @@ impl Builder {
         };
         Weights { buffer, first, rows, columns, transposed }
     }
+}
+
+/// Picoseconds.
+fn cost(seconds: f64) -> u64 {
+    (seconds * 1e12) as u64
 }
 
 fn matrix(w: &Tensor) -> (usize, usize) {

@@ -225,7 +225,7 @@ impl Cuts {
             _ => false,
         };
         let shapes: Vec<_> = info.operands.iter().map(|o| o.shape().clone()).collect();
-        let own = t.op().flops(&shapes, t.shape());
+        let own = t.op().work(&shapes, t.shape()).flops();
         let computed = |o: &&Tensor| !self.get(o).reduces;
         info.closure_flops = info
             .operands
@@ -261,11 +261,18 @@ impl Cuts {
         info
     }
 
-    /// Whether computing a node again is not cheap.
-    pub fn is_costly(&self, info: &Info) -> bool {
+    /// Seconds of storing what a node computes, and reading it once.
+    pub fn stored(&self, info: &Info) -> f64 {
+        // A CPU reads a line of memory before it writes to it.
+        let passes = if self.target.kind == TargetKind::Cpu { 3 } else { 2 };
+        self.target.seconds_of_bytes(passes * 4 * info.tensor.shape().lanes() as u64)
+    }
+
+    /// Seconds of computing a node again from its operands.
+    pub fn again(&self, info: &Info) -> f64 {
         let shapes: Vec<_> = info.operands.iter().map(|o| o.shape().clone()).collect();
-        let flops = info.tensor.op().flops(&shapes, info.tensor.shape());
-        flops > self.target.recompute_flops * info.tensor.width() as u64
+        let work = info.tensor.op().work(&shapes, info.tensor.shape());
+        self.target.seconds_of(work * info.domain.elements() as u64, info.grain)
     }
 
     /// GPU: layers with the pointwise values after them, and wide values, work lane by lane, everything else row by row.

@@ -40,8 +40,9 @@ pub(super) fn domains(cuts: &Cuts) -> Vec<Axes> {
     let all = || cuts.order.iter().map(|id| &cuts.nodes[id]);
     let mut domains: Vec<Axes> = vec![];
     for info in all().filter(|i| is_line(cuts, i)) {
-        let expensive =
-            |i: &Info| i.runs_along(&info.domain) && (matches!(i.form, Form::Linear { .. }) || cuts.is_costly(i));
+        let expensive = |i: &Info| {
+            i.runs_along(&info.domain) && (matches!(i.form, Form::Linear { .. }) || cuts.again(i) > cuts.stored(i))
+        };
         if !domains.contains(&info.domain) && all().any(expensive) {
             domains.push(info.domain.clone());
         }

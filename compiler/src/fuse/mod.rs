@@ -8,9 +8,8 @@
 //! On a CPU a reduction over exactly the inner axis is also complete inside a tile that holds the whole axis, and what goes
 //! back from it into the same domain needs no cut (see [`lines`]).
 //!
-//! What a region needs from an earlier region of the same domain is either stored or computed again: the fewest channels
-//! are stored that spare it from computing narrow expensive values again; wide ones are recomputed (see
-//! [`Target::store_channels`]). On a GPU, parts of a stored concatenation are read back from it (see [`reread`]), and layers of
+//! What a region needs from an earlier region of the same domain is either stored or computed again, whatever takes less
+//! time on the target (see [`store`]). On a GPU, parts of a stored concatenation are read back from it (see [`reread`]), and layers of
 //! narrow networks need no cut (see [`resident`]).
 
 mod build;
@@ -24,6 +23,7 @@ mod store;
 pub use build::{Fused, Origin, fuse};
 pub use resident::LINE_CHANNELS;
 
+use crate::cost::Rates;
 use crate::step::Step;
 
 /// Most outputs of a layer of a resident network that is trained: weights and rows of wider ones do not fit into a workgroup side by
@@ -36,15 +36,14 @@ const RENDERED: usize = 256;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Target {
     pub kind: TargetKind,
-    /// Expensive values of at most this many channels are not computed again by a later region: they, or fewer channels
-    /// computed from them, are stored.
+    /// By which it is decided what takes longer, to store a value or to compute it again.
+    pub rates: Rates,
+    /// Memory for that: values of at most this many channels may be stored in any case,
     pub store_channels: usize,
-    /// So are expensive values of at most this many bytes.
+    /// so may values of at most this many bytes,
     pub store_free_bytes: usize,
-    /// And wider ones, as long as those of one region take no more bytes than this together.
+    /// and wider ones, as long as those of one region take no more bytes than this together.
     pub store_bytes: usize,
-    /// Operations per channel up to which an op is not expensive.
-    pub recompute_flops: u64,
     /// Operations per element up to which values computed from inputs alone are free.
     pub free_flops: u64,
     /// Longest inner axis that is one tile in any case: reductions along it stay inside a tile; 0 where they never do.
@@ -69,10 +68,10 @@ impl Target {
     pub fn cpu() -> Target {
         Target {
             kind: TargetKind::Cpu,
+            rates: Rates::CPU,
             store_channels: 32,
             store_free_bytes: 1 << 18,
             store_bytes: 192 << 20,
-            recompute_flops: 64,
             free_flops: 600,
             tile_rows: 192,
             line_rows: 1024,
@@ -83,10 +82,10 @@ impl Target {
     pub fn gpu() -> Target {
         Target {
             kind: TargetKind::Gpu,
+            rates: Rates::GPU,
             store_channels: usize::MAX,
             store_free_bytes: 0,
             store_bytes: 0,
-            recompute_flops: 16,
             free_flops: 600,
             tile_rows: 0,
             line_rows: 0,

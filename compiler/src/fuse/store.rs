@@ -1,39 +1,41 @@
-//! Which values of earlier regions a region stores rather than recomputes: a minimum cut.
+//! Which values of earlier regions a region stores rather than computes again: a minimum cut.
 //!
-//! A region needs some values that regions before it compute over the same domain. Any set of stored values that separates
-//! what it needs from what is too expensive to compute again will do; the smallest one, in channels, is a minimum vertex
-//! cut between the two (as in the partitioning of forward and backward passes in PyTorch's AOTAutograd). Expensive values
-//! that are too wide to store do not count: they are recomputed.
+//! A region needs some values that regions before it compute over the same domain. Each value on the way to them is either
+//! stored, which takes the time to write and to read it, or computed again from what it is computed from, which takes the time
+//! of that. The cheapest choice is a minimum cut of a network in which a value is two nodes: cutting the edge between them stores
+//! it, cutting an edge from the source to the first computes it again. (The partitioning of forward and backward passes in
+//! PyTorch's AOTAutograd is a cut, too, but of what may not be computed again from what is needed.)
 
 use std::collections::{HashMap, VecDeque};
 
 /// A value that could be stored.
 pub(super) struct Candidate {
     pub id: u64,
-    /// Cost of storing it.
-    pub channels: u64,
-    /// It must not be computed again: it or something computed from it is stored.
-    pub expensive: bool,
+    /// What storing it costs, [`NEVER`] where it must not be; of a value that lies in memory in any case, what reading it costs.
+    pub stored: u64,
+    /// What computing it again costs, given its operands; [`NEVER`] where it lies in memory in any case.
+    pub again: u64,
     /// The candidates it is computed from.
     pub operands: Vec<u64>,
 }
 
-/// The cheapest set of candidates to store, so that `needed` can be computed without computing expensive ones again.
+/// More than anything costs.
+pub(super) const NEVER: u64 = u64::MAX;
+
+/// The cheapest set of candidates to read from memory, so that `needed` can be computed.
 pub(super) fn choose(candidates: &[Candidate], needed: &[u64]) -> Vec<u64> {
     let index: HashMap<u64, usize> = candidates.iter().enumerate().map(|(i, c)| (c.id, i)).collect();
     let (source, sink) = (2 * candidates.len(), 2 * candidates.len() + 1);
     let mut flow = Flow::new(2 * candidates.len() + 2);
     for (i, c) in candidates.iter().enumerate() {
-        flow.edge(2 * i, 2 * i + 1, c.channels);
-        if c.expensive {
-            flow.edge(source, 2 * i, u64::MAX);
-        }
+        flow.edge(2 * i, 2 * i + 1, c.stored);
+        flow.edge(source, 2 * i, c.again);
         for o in &c.operands {
-            flow.edge(2 * index[o] + 1, 2 * i, u64::MAX);
+            flow.edge(2 * index[o] + 1, 2 * i, NEVER);
         }
     }
     for n in needed {
-        flow.edge(2 * index[n] + 1, sink, u64::MAX);
+        flow.edge(2 * index[n] + 1, sink, NEVER);
     }
     flow.maximise(source, sink);
     // Of all minimum cuts the one nearest to the needs: what is stored is then used as it is.
@@ -112,30 +114,55 @@ impl Flow {
 
 #[cfg(test)]
 mod tests {
-    use super::{Candidate, choose};
+    use super::{Candidate, NEVER, choose};
 
-    fn candidate(id: u64, channels: u64, expensive: bool, operands: &[u64]) -> Candidate {
-        Candidate { id, channels, expensive, operands: operands.to_vec() }
+    fn candidate(id: u64, stored: u64, again: u64, operands: &[u64]) -> Candidate {
+        Candidate { id, stored, again, operands: operands.to_vec() }
     }
 
     /// layer(3) -> series of many 2-channel values, all needed: the layer's 3 channels are stored.
     #[test]
     fn a_narrow_source_is_stored_once() {
         let all: Vec<Candidate> =
-            std::iter::once(candidate(0, 3, true, &[])).chain((1..9).map(|i| candidate(i, 2, false, &[0]))).collect();
+            std::iter::once(candidate(0, 3, 50, &[])).chain((1..9).map(|i| candidate(i, 2, 1, &[0]))).collect();
         assert_eq!(choose(&all, &[1, 2, 3, 4, 5, 6, 7, 8]), vec![0]);
     }
 
     /// layer(34) -> sum(2), needed: the sum is stored.
     #[test]
     fn a_narrow_result_is_stored_instead_of_its_wide_source() {
-        let all = [candidate(0, 34, true, &[]), candidate(1, 34, false, &[0]), candidate(2, 2, false, &[1])];
+        let all = [candidate(0, 34, 500, &[]), candidate(1, 34, 1, &[0]), candidate(2, 2, 1, &[1])];
         assert_eq!(choose(&all, &[2]), vec![2]);
     }
 
     #[test]
     fn what_is_cheap_from_inputs_is_not_stored() {
-        let all = [candidate(0, 2, false, &[]), candidate(1, 2, false, &[0])];
+        let all = [candidate(0, 2, 1, &[]), candidate(1, 2, 0, &[0])];
+        assert!(choose(&all, &[1]).is_empty());
+    }
+
+    /// Each step of a chain is cheaper than storing it, all together are not.
+    #[test]
+    fn the_last_of_a_long_chain_is_stored() {
+        let chain = |length: u64| -> Vec<Candidate> {
+            (0..length).map(|i| candidate(i, 8, 3, &i.checked_sub(1).into_iter().collect::<Vec<_>>())).collect()
+        };
+        assert!(choose(&chain(2), &[1]).is_empty());
+        assert_eq!(choose(&chain(3), &[2]), vec![2]);
+    }
+
+    /// A value of one channel from many that lie in memory: reading those takes longer than reading it.
+    #[test]
+    fn what_must_be_read_to_compute_a_value_counts() {
+        let all = |wide: u64| [candidate(0, wide, NEVER, &[]), candidate(1, 2, 1, &[0])];
+        assert_eq!(choose(&all(64), &[1]), vec![1]);
+        assert_eq!(choose(&all(0), &[1]), vec![0]);
+    }
+
+    /// What must not be stored is computed again, whatever it costs.
+    #[test]
+    fn without_room_all_is_computed_again() {
+        let all = [candidate(0, NEVER, 500, &[]), candidate(1, NEVER, 1, &[0])];
         assert!(choose(&all, &[1]).is_empty());
     }
 }

@@ -1,6 +1,7 @@
 //! Maximum over the channels; its gradient is shared equally between ties.
 
 use super::{Form, Op, Sample, expect_dtype, pointwise::unary};
+use crate::cost::Work;
 use crate::graph::{Channels, Misfit, Shape, Tensor};
 use crate::reference::{Array, Lane};
 use crate::scalar::DType;
@@ -31,8 +32,8 @@ impl Op for ChannelMax {
         let ties = hit.sum_channels();
         vec![Some(hit * (g / ties))]
     }
-    fn flops(&self, inputs: &[Shape], _: &Shape) -> u64 {
-        inputs[0].channels.count() as u64
+    fn work(&self, inputs: &[Shape], _: &Shape) -> Work {
+        Work::others(inputs[0].channels.count() as u64)
     }
 }
 

@@ -1,6 +1,7 @@
 //! Sums over groups of channels; the adjoint of picking channels.
 
 use super::{Form, Op, Sample, SampleInput, expect_dtype};
+use crate::cost::Work;
 use crate::graph::{Axis, Channels, Misfit, Shape, Tensor};
 use crate::reference::{Array, Lane};
 use crate::scalar::DType;
@@ -43,8 +44,8 @@ impl Op for ChannelSum {
         }
         format!("sum_channels {}", hash.finalize())
     }
-    fn flops(&self, _: &[Shape], _: &Shape) -> u64 {
-        self.0.iter().map(|g| g.len() as u64).sum()
+    fn work(&self, _: &[Shape], _: &Shape) -> Work {
+        Work::others(self.0.iter().map(|g| g.len() as u64).sum())
     }
 }
 

@@ -1,6 +1,7 @@
 //! Exclusive cumulative sums, for transmittance along a ray.
 
 use super::{Form, Op, Sample, SampleInput, expect_dtype};
+use crate::cost::Work;
 use crate::graph::{Axis, Misfit, Shape, Tensor};
 use crate::reference::Array;
 use crate::scalar::DType;
@@ -40,8 +41,8 @@ impl Op for CumSum {
     fn vjp(&self, _: &[Tensor], _: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
         vec![Some(Tensor::record(CumSum { axis: self.axis.clone(), reverse: !self.reverse }, &[g]))]
     }
-    fn flops(&self, _: &[Shape], out: &Shape) -> u64 {
-        out.channels.count() as u64
+    fn work(&self, _: &[Shape], out: &Shape) -> Work {
+        Work::others(out.channels.count() as u64)
     }
 }
 

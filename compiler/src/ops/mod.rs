@@ -3,6 +3,7 @@
 //! An op's file ends in `samples()`: inputs on which shape errors, reference against kernels, and first and second
 //! derivatives are checked for it, with no further code. The list at the bottom of this page is the registry.
 
+use crate::cost::Work;
 use crate::graph::{Channels, Misfit, Shape, Tensor};
 use crate::reference::Array;
 use crate::scalar::{DType, ScalarProgram};
@@ -33,14 +34,14 @@ pub trait Op: Any + Debug + Send + Sync {
     /// [`crate::autodiff`] sums over what it lacks.
     fn vjp(&self, inputs: &[Tensor], output: &Tensor, grad: &Tensor) -> Vec<Option<Tensor>>;
 
-    /// Floating-point operations per element of the op's domain, given the operand shapes, for the cost model.
-    fn flops(&self, inputs: &[Shape], out: &Shape) -> u64 {
+    /// Arithmetic per element of the op's domain, given the operand shapes, for the cost model.
+    fn work(&self, inputs: &[Shape], out: &Shape) -> Work {
         match self.form() {
-            Form::Pointwise(p) => p.flops() * out.channels.count() as u64,
-            Form::Linear { .. } => 2 * inputs[1].channels.count() as u64,
-            Form::Outer => 2 * out.channels.count() as u64,
-            Form::SymEig { n } => 60 * (n * n * n) as u64,
-            _ => 0,
+            Form::Pointwise(p) => Work::others(p.flops() * out.channels.count() as u64),
+            Form::Linear { .. } => Work::products(inputs[1].channels.count()),
+            Form::Outer => Work::products(out.channels.count()),
+            Form::SymEig { n } => Work::others(60 * (n * n * n) as u64),
+            _ => Work::default(),
         }
     }
 

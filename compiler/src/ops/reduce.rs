@@ -1,6 +1,7 @@
 //! Sum and maximum over axes.
 
 use super::{Form, Op, Reduction, Sample, SampleInput, expect_dtype};
+use crate::cost::Work;
 use crate::graph::{Axes, Axis, Misfit, Shape, Tensor};
 use crate::reference::Array;
 use crate::scalar::DType;
@@ -65,8 +66,8 @@ impl Op for Reduce {
         };
         vec![Some(grad)]
     }
-    fn flops(&self, _: &[Shape], out: &Shape) -> u64 {
-        out.channels.count() as u64
+    fn work(&self, _: &[Shape], out: &Shape) -> Work {
+        Work::others(out.channels.count() as u64)
     }
 }
 

@@ -2,6 +2,7 @@
 
 use super::take::index_shape;
 use super::{Form, Op, Sample, SampleInput, expect_dtype};
+use crate::cost::Work;
 use crate::graph::{Axes, Axis, Misfit, Shape, Tensor};
 use crate::reference::Array;
 use crate::scalar::DType;
@@ -50,8 +51,8 @@ impl Op for Scatter {
     fn vjp(&self, inputs: &[Tensor], _: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
         vec![Some(g.take(&inputs[1], &self.axis)), None]
     }
-    fn flops(&self, _: &[Shape], out: &Shape) -> u64 {
-        out.channels.count() as u64
+    fn work(&self, _: &[Shape], out: &Shape) -> Work {
+        Work::others(out.channels.count() as u64)
     }
 }
 

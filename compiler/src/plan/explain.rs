@@ -58,10 +58,13 @@ impl fmt::Display for Program {
             self.memory_bytes() as f64 * 1e-6,
             self.target.kind,
         )?;
+        let predicted = self.predicted(|_| 4);
+        writeln!(f, "predicted: {:.3} ms on a device of {}", 1e3 * predicted.iter().sum::<f64>(), self.target.rates)?;
         for (i, launch) in self.launches.iter().enumerate() {
             let region = &launch.region;
             writeln!(f, "\n{}  over {}", launch.name, region.domain)?;
-            writeln!(f, "  {:.3} MFLOP, {:.3} MB", region.flops() as f64 * 1e-6, self.launch_bytes(i) as f64 * 1e-6)?;
+            let (flops, bytes) = (region.flops() as f64 * 1e-6, self.launch_bytes(i) as f64 * 1e-6);
+            writeln!(f, "  {flops:.3} MFLOP, {bytes:.3} MB, {:.1} us predicted", 1e6 * predicted[i])?;
             writeln!(f, "  fused: {}", fused(region))?;
             if launch.recomputed > 0 {
                 writeln!(f, "  recomputed: {} values of earlier launches", launch.recomputed)?;

@@ -4,6 +4,7 @@
 //! those axes; its stores write values, or combine them over the axes that the target buffer lacks. Both lowerings, to a
 //! CPU tile program and to a naga module, start from here.
 
+use crate::cost::Work;
 use crate::graph::{Axes, Axis};
 use crate::ops::Reduction;
 use crate::scalar::{DType, ScalarProgram};
@@ -195,32 +196,36 @@ impl Region {
         }
         true
     }
-    /// Floating-point operations of one run.
-    pub fn flops(&self) -> u64 {
-        let per = |axes: &Axes| axes.elements() as u64;
+    /// Arithmetic of one run.
+    pub fn work(&self) -> Work {
+        let (products, others) = (Work::products, Work::others);
         let body = self.body.iter().map(|i| {
             let width = i.channels as u64;
             let each = match &i.op {
-                RegionOp::Map(p) => p.flops() * width,
-                RegionOp::Linear(w) => 2 * (w.rows * w.columns) as u64,
-                RegionOp::RowLinear { rows, columns, .. } => 2 * (rows * columns) as u64,
-                RegionOp::SymEig { n } => 60 * (n * n * n) as u64,
-                RegionOp::ChannelSum(g) => g.iter().map(|g| g.len() as u64).sum(),
-                RegionOp::RowReduce(_) => width * self.inner.as_ref().map_or(1, Axis::size) as u64,
-                RegionOp::RowOuter | RegionOp::ChannelMax | RegionOp::CumSum { .. } => width,
-                _ => 0,
+                RegionOp::Map(p) => others(p.flops() * width),
+                RegionOp::Linear(w) => products(w.rows * w.columns),
+                RegionOp::RowLinear { rows, columns, .. } => products(rows * columns),
+                RegionOp::SymEig { n } => others(60 * (n * n * n) as u64),
+                RegionOp::ChannelSum(g) => others(g.iter().map(|g| g.len() as u64).sum()),
+                RegionOp::RowReduce(_) => others(width * self.inner.as_ref().map_or(1, Axis::size) as u64),
+                RegionOp::RowOuter | RegionOp::ChannelMax | RegionOp::CumSum { .. } => others(width),
+                _ => Work::default(),
             };
-            each * per(&i.axes)
+            each * i.axes.elements() as u64
         });
         let stores = self.stores.iter().map(|s| {
             let each = match s {
-                Store::Write { .. } => 0,
-                Store::Reduce { value, .. } | Store::Scatter { value, .. } => self.inst(*value).channels as u64,
-                Store::Outer { x, d, .. } => 2 * (self.inst(*x).channels * self.inst(*d).channels) as u64,
+                Store::Write { .. } => Work::default(),
+                Store::Reduce { value, .. } | Store::Scatter { value, .. } => others(self.inst(*value).channels as u64),
+                Store::Outer { x, d, .. } => products(self.inst(*x).channels * self.inst(*d).channels),
             };
-            each * per(&self.domain)
+            each * self.domain.elements() as u64
         });
-        body.sum::<u64>() + stores.sum::<u64>()
+        body.chain(stores).sum()
+    }
+    /// Floating-point operations of one run.
+    pub fn flops(&self) -> u64 {
+        self.work().flops()
     }
 
     /// The region without instructions that no store needs, renumbered.
