@@ -14,7 +14,7 @@ use std::fmt;
 pub struct Rates {
     /// 10^9 operations a second of multiply-adds in single precision, two each.
     pub gflops: u32,
-    /// The same of what matrix products multiply: more where a device has matrices of halves and is to use them.
+    /// The same of what matrix products are made of: more where a device has matrices of halves and is to use them.
     pub product_gflops: u32,
     /// 10^6 bytes a second to and from memory.
     pub mbytes: u32,
@@ -29,10 +29,17 @@ impl Rates {
     pub const CPU: Rates = Rates { gflops: 300, product_gflops: 300, mbytes: 15_000, launch_ns: 10_000, workgroups: 1 };
     /// Of a large GPU, for who has not measured one.
     pub const GPU: Rates =
-        Rates { gflops: 49_000, product_gflops: 49_000, mbytes: 3_500_000, launch_ns: 3_000, workgroups: 128 };
-    /// Of a driver that computes on a CPU, which are not measured either. More workgroups than cores, which then end together.
+        Rates { gflops: 49_000, product_gflops: 620_000, mbytes: 3_500_000, launch_ns: 3_000, workgroups: 128 };
+    /// Of a driver that computes on a CPU, which are not measured either: tiles reach less than its multiply-adds, since lanes of a
+    /// vector read one by one. More workgroups than cores, which then end together.
     pub const SOFTWARE: Rates =
-        Rates { gflops: 64, product_gflops: 64, mbytes: 4_000, launch_ns: 50_000, workgroups: 16 };
+        Rates { gflops: 64, product_gflops: 6, mbytes: 4_000, launch_ns: 50_000, workgroups: 16 };
+
+    /// The same where nothing is multiplied in matrices of halves.
+    pub const fn single(self) -> Rates {
+        let least = if self.product_gflops < self.gflops { self.product_gflops } else { self.gflops };
+        Rates { product_gflops: least, ..self }
+    }
 
     /// The nearest of 1, 1.5, 2, 3, 4, 6 and so on, at least 1: what is measured twice should be the same.
     pub fn rounded(measured: f64) -> u32 {
@@ -93,41 +100,29 @@ impl std::iter::Sum for Work {
     }
 }
 
-/// Shares of a device's rates that kernels reach, measured (docs/measured.md) where nothing else is said.
-struct Shares {
-    products: f64,
-    others: f64,
-    bytes: f64,
-}
+/// Share of its best that a device's memory gives a kernel; like the other shares here measured (docs/measured.md).
+const BYTES: f64 = 0.8;
 
 impl Target {
-    fn shares(&self, grain: Grain) -> Shares {
-        let halves = self.rates.product_gflops > self.rates.gflops;
-        let products = match (self.kind, grain) {
-            (TargetKind::Cpu, _) => 0.8,
-            // Their products are of single precision. Each takes as many bytes of workgroup memory as a processor reads while it
-            // multiplies three times; not measured.
-            (_, Grain::Tile) => 0.35 * f64::from(self.rates.gflops) / f64::from(self.rates.product_gflops),
-            _ if halves => 0.2,
-            _ => 0.7,
-        };
-        // A CPU passes every instruction's lanes through its first cache.
-        let others = if self.kind == TargetKind::Cpu { 0.4 } else { 0.5 };
-        Shares { products, others, bytes: 0.8 }
-    }
-
     /// Seconds that arithmetic takes.
     pub fn seconds_of(&self, work: Work, grain: Grain) -> f64 {
-        let shares = self.shares(grain);
-        let products = work.products as f64 / (shares.products * f64::from(self.rates.product_gflops));
-        // An instruction takes the place of a multiply-add.
-        let others = 2.0 * work.others as f64 / (shares.others * f64::from(self.rates.gflops));
-        (products + others) * 1e-9
+        let [single, best] = [self.rates.gflops, self.rates.product_gflops].map(f64::from);
+        let products = match (self.kind, grain) {
+            (TargetKind::Cpu, _) => 0.8 * best,
+            // In single precision. A multiply-add takes as many bytes of workgroup memory as a processor reads in the time of
+            // three; not measured.
+            (_, Grain::Tile) => 0.35 * single.min(best),
+            _ if best > single => 0.2 * best,
+            _ => 0.7 * best,
+        };
+        // An instruction takes the place of a multiply-add; a CPU passes its lanes through the first cache.
+        let others = if self.kind == TargetKind::Cpu { 0.2 * single } else { 0.25 * single };
+        (work.products as f64 / products + work.others as f64 / others) * 1e-9
     }
 
     /// Seconds that bytes take to or from memory.
     pub fn seconds_of_bytes(&self, bytes: u64) -> f64 {
-        bytes as f64 / (self.shares(Grain::Row).bytes * f64::from(self.rates.mbytes)) * 1e-6
+        bytes as f64 / (BYTES * f64::from(self.rates.mbytes)) * 1e-6
     }
 
     /// Seconds of a launch that does nothing.

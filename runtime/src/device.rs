@@ -3,9 +3,12 @@
 use crate::{DeviceError, RunError};
 use raygrad_compiler::{Program, Target};
 use raygrad_kernels::cpu::{Isa, Products};
-#[cfg(feature = "gpu")]
-use raygrad_kernels::gpu::{Half, SOFTWARE_TILES, storages};
 use std::sync::Arc;
+#[cfg(feature = "gpu")]
+use {
+    raygrad_compiler::cost::Rates,
+    raygrad_kernels::gpu::{Half, SOFTWARE_TILES, storages},
+};
 
 /// A device to run sessions on.
 #[derive(Clone)]
@@ -20,9 +23,9 @@ pub enum Device {
     Vulkan { gpu: Arc<crate::vulkan::Gpu>, forms: Forms },
 }
 
-/// Which forms of kernels a device runs, where there is a choice.
+/// Which forms of kernels a device runs, where there is a choice, and what it is chosen by.
 #[cfg(feature = "gpu")]
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Forms {
     /// What kernels use for half precision; `None` at single precision.
     pub half: Option<Half>,
@@ -30,14 +33,25 @@ pub struct Forms {
     pub tiles: u32,
     /// Networks whose layers have at most this many outputs stay in a workgroup ([`Target::resident`]); 0: none do.
     pub resident: usize,
+    /// What the device does at best; of a GPU that was not measured ([`Device::measured`]), what a large one does.
+    pub rates: Rates,
+}
+
+#[cfg(feature = "gpu")]
+impl Default for Forms {
+    fn default() -> Forms {
+        Forms { half: None, tiles: 0, resident: 0, rates: Rates::GPU }
+    }
 }
 
 #[cfg(feature = "gpu")]
 impl Forms {
     /// What suits an adapter: software has tiles of its own.
     fn of(adapter: &crate::Adapter) -> Forms {
-        let software = adapter.kind == crate::AdapterKind::Software;
-        Forms { tiles: if software { SOFTWARE_TILES } else { 0 }, ..Forms::default() }
+        match adapter.kind {
+            crate::AdapterKind::Software => Forms { tiles: SOFTWARE_TILES, rates: Rates::SOFTWARE, ..Forms::default() },
+            _ => Forms::default(),
+        }
     }
 }
 
@@ -195,6 +209,22 @@ impl Device {
         }
     }
 
+    /// The same device with its rates, by which it is chosen what is stored, which tiles matrix products have and which form narrow
+    /// networks: measured, which takes some tenths of a second, or known from before (they are kept on disk, rounded, by device
+    /// and driver). Those of the CPU and of drivers in software are not measured: a step has the same bits wherever it runs.
+    pub fn measured(self) -> Result<Device, RunError> {
+        #[cfg(feature = "gpu")]
+        return crate::gpu::rates::measured(self);
+        #[cfg(not(feature = "gpu"))]
+        Ok(self)
+    }
+
+    /// Seconds that every launch of a program should take by the cost model ([`raygrad_compiler::cost`]).
+    pub fn predicted(&self, program: &Program) -> Vec<f64> {
+        let of_lane = self.lane_bytes(program);
+        program.predicted(|b| of_lane[b.0 as usize])
+    }
+
     /// The same device with the tiles that run a program fastest: found by running it with each choice, or known from before
     /// (results are kept on disk, by program, device, driver and precision). On the CPU there is nothing to choose.
     ///
@@ -233,7 +263,11 @@ impl Device {
         match self {
             Device::Cpu { .. } => Target::cpu(),
             #[cfg(feature = "gpu")]
-            _ => Target { resident: self.forms().resident, ..Target::gpu() },
+            _ => {
+                let Forms { half, resident, rates, .. } = self.forms();
+                let matrices = half.is_some_and(|h| h.matrices.is_some());
+                Target { resident, rates: if matrices { rates } else { rates.single() }, ..Target::gpu() }
+            }
         }
     }
 

@@ -82,7 +82,7 @@ impl Target {
     pub fn gpu() -> Target {
         Target {
             kind: TargetKind::Gpu,
-            rates: Rates::GPU,
+            rates: Rates::GPU.single(),
             store_channels: usize::MAX,
             store_free_bytes: 0,
             store_bytes: 0,

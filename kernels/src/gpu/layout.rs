@@ -6,6 +6,7 @@
 
 use super::LowerError;
 use super::half::{Half, Matrices, Storage, may_be_half, storages};
+use raygrad_compiler::cost::Rates;
 use raygrad_compiler::graph::Shape;
 use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::plan::region::BufferId;
@@ -30,6 +31,9 @@ pub struct Limits {
     /// How many of the largest tiles of matrix products not to use, which would otherwise be preferred: what is fastest
     /// depends on the device. [`TILES`] are there to choose from; the last are [`SOFTWARE_TILES`].
     pub tiles: u32,
+    /// Workgroups that keep all processors busy ([`raygrad_compiler::cost::Rates::workgroups`]): what there is to do is cut into
+    /// so many.
+    pub workgroups: u32,
     /// Mixed precision: what matrix products read is stored in half precision, and sums stay in single. `None`: all is
     /// single.
     pub half: Option<Half>,
@@ -53,6 +57,11 @@ impl Limits {
         }
     }
 
+    /// Invocations that keep all processors busy.
+    pub(super) fn invocations(&self) -> usize {
+        256 * self.workgroups as usize
+    }
+
     /// Cooperative matrices for tiles; those of drivers in software have none.
     pub(super) fn matrices(&self) -> Option<Matrices> {
         self.half.and_then(|h| h.matrices).filter(|_| self.tiles != SOFTWARE_TILES)
@@ -68,6 +77,7 @@ impl Default for Limits {
             max_workgroups: 65535,
             max_workgroup_bytes: 16 << 10,
             tiles: 0,
+            workgroups: Rates::GPU.workgroups,
             half: None,
         }
     }

@@ -46,7 +46,7 @@ mod vanish;
 pub use half::{Half, Matrices, Storage, storages};
 pub use layout::{Arena, ArenaId, Inputs, Limits, Part, Place, SOFTWARE_TILES, TILES};
 
-pub use peak::{copy, matrix_products, multiply_adds};
+pub use peak::{copy, launches, matrix_products, multiply_adds};
 
 use layout::Layout;
 use raygrad_compiler::graph::Shape;

@@ -15,11 +15,9 @@ use raygrad_compiler::plan::region::{BufferId, Region, RegionOp, Store};
 use raygrad_compiler::scalar::DType;
 use std::ops::Range;
 
-/// Workgroups of tiles that fill a device, and of smaller ones.
-const ENOUGH: usize = 256;
-const ENOUGH_SMALL: usize = 512;
-/// The same of a driver in software: a CPU has fewer processors.
-const ENOUGH_SOFTWARE: usize = 64;
+/// Workgroups of large tiles for a processor, and of smaller ones.
+const EACH: usize = 2;
+const EACH_SMALL: usize = 4;
 /// Rows of a chunk, at least.
 const CHUNK_ROWS: usize = 64;
 /// Chunks, at most.
@@ -58,11 +56,8 @@ pub(super) fn kernels(
     }
     // All parts have the same chunks, so that one kernel sums them.
     let groups: usize = parts.iter().map(|p| p.tiles() * kept).max().unwrap_or(1);
-    let enough = match parts.iter().any(|p| p.tile.direct) {
-        true => ENOUGH_SOFTWARE,
-        false if parts.iter().any(|p| p.tile.invocations() > 64) => ENOUGH,
-        false => ENOUGH_SMALL,
-    };
+    let each = if parts.iter().any(|p| p.tile.invocations() > 64) { EACH } else { EACH_SMALL };
+    let enough = each * limits.workgroups as usize;
     let wanted = enough.div_ceil(groups).min(rows.div_ceil(CHUNK_ROWS)).min(MAX_CHUNKS);
     let depth = parts.iter().map(|p| p.tile.k).max().unwrap_or(1) as usize;
     let per_chunk = rows.div_ceil(wanted).next_multiple_of(depth);

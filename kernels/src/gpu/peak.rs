@@ -87,8 +87,10 @@ const WORKGROUPS_OF_FLOATS: u32 = 1024;
 /// Vectors that an invocation goes through side by side.
 const VECTORS: u32 = 8;
 
-/// A program of multiply-adds in registers, and how many operations it does, two each.
-pub fn multiply_adds() -> Result<(GpuProgram, f64), LowerError> {
+/// A program of multiply-adds in registers, and how many operations it does, two each; by one workgroup, or as many as fill any
+/// device.
+pub fn multiply_adds(alone: bool) -> Result<(GpuProgram, f64), LowerError> {
+    let workgroups = if alone { 1 } else { WORKGROUPS_OF_FLOATS };
     let mut b = Builder::new(INVOCATIONS);
     let at = number(&mut b);
     let out = b.storage("done", Kind::F32, false);
@@ -119,9 +121,9 @@ pub fn multiply_adds() -> Result<(GpuProgram, f64), LowerError> {
     let none = b.f(0.0);
     let nothing = b.math(naga::MathFunction::Min, &[total, none]);
     b.store(out, at, nothing);
-    let invocations = u64::from(WORKGROUPS_OF_FLOATS * INVOCATIONS);
+    let invocations = u64::from(workgroups * INVOCATIONS);
     let operations = (2 * 4 * VECTORS * LENGTH) as f64 * invocations as f64;
-    Ok((program(b, None, WORKGROUPS_OF_FLOATS, &[("done", invocations)])?, operations))
+    Ok((program(b, None, workgroups, &[("done", invocations)])?, operations))
 }
 
 /// Lanes of a buffer that passes through memory: more than caches hold, with its copy.
@@ -137,6 +139,20 @@ pub fn copy() -> Result<(GpuProgram, f64), LowerError> {
     b.store(to, at, value);
     let workgroups = (LANES / 4) as u32 / INVOCATIONS;
     Ok((program(b, None, workgroups, &[("to", LANES), ("from", LANES)])?, 8.0 * LANES as f64))
+}
+
+/// A program of so many launches that wait for each other and do next to nothing.
+pub fn launches(count: usize) -> Result<GpuProgram, LowerError> {
+    let mut b = Builder::new(INVOCATIONS);
+    let at = number(&mut b);
+    let out = b.storage("done", Kind::F32, false);
+    b.make_writable(out);
+    let (value, one) = (b.load(out, at), b.f(1.0));
+    let value = b.add(value, one);
+    b.store(out, at, value);
+    let mut all = program(b, None, 1, &[("done", u64::from(INVOCATIONS))])?;
+    all.launches = vec![all.launches[0].clone(); count];
+    Ok(all)
 }
 
 /// The number of an invocation.

@@ -19,8 +19,6 @@ use raygrad_compiler::scalar::DType;
 const MAX_CHANNELS: usize = 64;
 /// Rows up to which one invocation sums alone.
 const FEW_ROWS: usize = 64;
-/// Results from which invocations that sum alone fill a device.
-const MANY_RESULTS: usize = 16384;
 /// Rows of a chunk, at least.
 const CHUNK_ROWS: usize = 2048;
 /// The same where each invocation takes four rows at a time, and results alone fill a device.
@@ -126,11 +124,13 @@ fn group(
     let results = kept * channels;
     let fours = in_fours(layout, region, &over);
     let work = Reducer { region, targets, by_lane, keep, over, channels, fours };
-    if rows <= FEW_ROWS || results >= MANY_RESULTS && rows < 32768 {
+    // Half of what fills a device is enough for invocations that sum alone.
+    let many = limits.invocations() / 2;
+    if rows <= FEW_ROWS || results >= many && rows < 32768 {
         return Ok(vec![work.alone(layout, limits, name)?]);
     }
     let chunk_rows = if fours && results >= FEW_ROWS { CHUNK_ROWS_OF_FOURS } else { CHUNK_ROWS };
-    let chunks = rows.div_ceil(chunk_rows).min(MAX_CHUNKS.min((MANY_RESULTS * 16).div_ceil(results)).max(1));
+    let chunks = rows.div_ceil(chunk_rows).min(MAX_CHUNKS.min((many * 16).div_ceil(results)).max(1));
     let per_chunk = rows.div_ceil(chunks).next_multiple_of(WORKGROUP as usize);
     let chunks = rows.div_ceil(per_chunk);
     if chunks == 1 {

@@ -17,8 +17,6 @@ use raygrad_compiler::ops::Reduction;
 use raygrad_compiler::plan::region::{BufferId, InstId, Region, RegionOp, Store};
 use std::collections::HashMap;
 
-/// Lines that fill a device.
-const MANY_LINES: usize = 1 << 15;
 /// Shortest line that is shared.
 const SHARED: usize = 32;
 /// Most channels of a value that is the same along a line and is computed before it.
@@ -58,7 +56,7 @@ pub(super) fn kernel(layout: &mut Layout, limits: Limits, name: &str, region: &R
     let plan = plan(layout, region)?;
     let inner = region.inner.clone().unwrap_or_else(|| Axis::new("once", 1));
     let lines = region.domain.without(&inner);
-    let shared = lines.elements() < MANY_LINES
+    let shared = lines.elements() < limits.invocations()
         && inner.size() >= SHARED
         && !plan.chained
         && plan.shared_bytes(region) <= limits.max_workgroup_bytes as usize;

@@ -16,8 +16,6 @@ use raygrad_compiler::scalar::DType;
 
 /// Rows of a chunk, at most: below the iterations that old software drivers stop at.
 const CHUNK_ROWS: usize = 16384;
-/// Invocations that fill a device.
-const ENOUGH: usize = 32768;
 /// Channels from which a channel is a dimension of the dispatch.
 const BY_LANE: usize = 4;
 
@@ -36,7 +34,7 @@ pub(super) fn kernels(
     let (rows, lanes) = (over.elements(), slots.elements() * channels);
     let invocations = if by_lane { lanes } else { slots.elements() };
     // Enough chunks for a full device, but a chunk has some rows, and partial results some bound.
-    let wanted = ENOUGH.div_ceil(invocations).min(rows.div_ceil(64)).min(MAX_CHUNKS);
+    let wanted = limits.invocations().div_ceil(invocations).min(rows.div_ceil(64)).min(MAX_CHUNKS);
     let chunks = wanted.max(rows.div_ceil(CHUNK_ROWS));
     let per_chunk = rows.div_ceil(chunks);
     let chunks = rows.div_ceil(per_chunk);

@@ -13,8 +13,6 @@ use super::layout::{Limits, SOFTWARE_TILES};
 use super::memory::Emit;
 use super::sums::Sums;
 
-/// Workgroups that keep a device busy.
-const ENOUGH: u64 = 128;
 /// Invocations of a workgroup that every device can start.
 const MOST_INVOCATIONS: u32 = 256;
 /// Terms of sums after which writing them does not count.
@@ -37,16 +35,24 @@ pub(super) struct Tile {
 }
 
 impl Tile {
-    /// A tile for products of `[m, k]` and `[k, n]`, so many of them: the largest that leaves enough workgroups.
+    /// The tile for products of `[m, k]` and `[k, n]`, so many of them, that takes the least time.
     pub fn of(limits: &Limits, (m, n, k): (usize, usize, usize), products: usize) -> Tile {
-        let fits = |t: &Tile| {
-            let workgroups = m.div_ceil(t.m as usize) as u64 * n.div_ceil(t.n as usize) as u64 * products as u64;
-            workgroups >= ENOUGH && t.bytes() <= limits.max_workgroup_bytes && t.invocations() <= MOST_INVOCATIONS
+        // What a processor computes one after the other, at the tile's rate: at least one tile.
+        let time = |(t, rate): &(Tile, f64)| {
+            let workgroups = m.div_ceil(t.m as usize) * n.div_ceil(t.n as usize) * products;
+            let each = (workgroups as f64 / f64::from(limits.workgroups)).max(1.0);
+            each * f64::from(t.m * t.n) / rate
+        };
+        let fits = |t: &Tile| t.bytes() <= limits.max_workgroup_bytes && t.invocations() <= MOST_INVOCATIONS;
+        // Of tiles and their rates, relative to each other; the last one fits in any case.
+        let fastest = |all: &[(Tile, f64)]| {
+            let (last, larger) = (all[all.len() - 1], &all[..all.len() - 1]);
+            let others = larger.iter().skip(limits.tiles as usize).filter(|(t, _)| fits(t));
+            others.chain([&last]).min_by(|a, b| time(a).total_cmp(&time(b))).map_or(last.0, |(t, _)| *t)
         };
         if limits.tiles == SOFTWARE_TILES && n > 16 {
             return Tile::direct(m, n, k);
         }
-        let skipped = limits.tiles as usize;
         if let Some(matrices) = limits.matrices()
             && n > 32
             && k >= 16
@@ -57,13 +63,13 @@ impl Tile {
                 let (own_m, own_n) = (own_m * side, own_n * side);
                 Tile { m, n, k: 32, own_m, own_n, matrices: Some(matrices), direct: false }
             };
-            let all = match n {
-                0..=64 => vec![tile(128, 64, (2, 2))],
-                65..=128 => vec![tile(256, 128, (4, 4)), tile(64, 128, (2, 4))],
+            let smallest = (tile(64, 64, (2, 2)), 0.7);
+            return match n {
+                0..=64 => fastest(&[(tile(128, 64, (2, 2)), 0.8), smallest]),
+                65..=128 => fastest(&[(tile(256, 128, (4, 4)), 1.0), (tile(64, 128, (2, 4)), 0.8), smallest]),
                 // All columns at once: the other operand is then read once.
-                _ => vec![tile(128, 256, (4, 4)), tile(64, 128, (2, 4))],
+                _ => fastest(&[(tile(128, 256, (4, 4)), 1.0), (tile(64, 128, (2, 4)), 0.8), smallest]),
             };
-            return all.into_iter().skip(skipped).find(fits).unwrap_or(tile(64, 64, (2, 2)));
         }
         let deep = match k {
             0..=4 => 4,
@@ -80,9 +86,11 @@ impl Tile {
             17..=32 => tile(64, 32, deep, 8, 4),
             _ => {
                 // Long sums write little.
-                let largest = if k >= LONG { tile(128, 128, deep, 8, 8) } else { tile(128, 64, deep.min(8), 8, 8) };
-                let all = [largest, tile(64, 64, deep, 8, 8)];
-                all.into_iter().skip(skipped).find(fits).unwrap_or(tile(32, 32, deep, 4, 4))
+                let largest = match k >= LONG {
+                    true => (tile(128, 128, deep, 8, 8), 1.0),
+                    false => (tile(128, 64, deep.min(8), 8, 8), 0.9),
+                };
+                fastest(&[largest, (tile(64, 64, deep, 8, 8), 0.84), (tile(32, 32, deep, 4, 4), 0.5)])
             }
         }
     }

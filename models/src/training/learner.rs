@@ -11,6 +11,9 @@ use raygrad_compiler::{Channels, Program, Shape, Step, compile};
 use raygrad_runtime::{Device, InputInfo, ProgramId, Session};
 use std::collections::BTreeMap;
 
+/// How many times as fast the other form of networks should be before it is chosen untried: predictions are no better.
+const CLEARLY: f64 = 1.25;
+
 /// Programs that share parameters, and how far training has got.
 pub struct Learner {
     pub session: Session,
@@ -26,9 +29,10 @@ pub struct Learner {
 }
 
 impl Learner {
-    /// Compiles a training step for a device, with `run.autotune` for the tiles, and each program for the form of its networks,
-    /// that are fastest there.
+    /// Compiles a training step for a device, by its rates; with `run.autotune` for the tiles, and each program for the form of its
+    /// networks, that are fastest there.
     pub fn new(device: Device, settings: &Settings, step: &Step) -> Result<(Learner, ProgramId), Error> {
+        let device = device.measured()?;
         let device = match settings.run.autotune {
             true => device.clone().tuned(&compile(step, &device.target())?)?,
             false => device,
@@ -55,14 +59,19 @@ impl Learner {
             return Ok(resident()?);
         }
         let layered = compile(step, &target)?;
-        if self.networks == Networks::Auto && self.autotune {
-            let resident = resident()?;
-            // Where no network is narrow there is no choice.
-            if resident.to_string() != layered.to_string() {
-                return Ok(self.device.faster([layered, resident])?);
-            }
+        if self.networks == Networks::Layered || target == target.with_resident(step) {
+            return Ok(layered);
         }
-        Ok(layered)
+        let resident = resident()?;
+        // Where no network is narrow there is no choice.
+        if resident.to_string() == layered.to_string() {
+            return Ok(layered);
+        }
+        if self.autotune {
+            return Ok(self.device.faster([layered, resident])?);
+        }
+        let seconds = |program: &Program| self.device.predicted(program).iter().sum::<f64>();
+        Ok(if CLEARLY * seconds(&resident) < seconds(&layered) { resident } else { layered })
     }
 
     pub fn steps_done(&self) -> usize {

@@ -3,6 +3,7 @@
 //! One file an adapter and driver, `raygrad/<key>.bin` in the user's folder for caches: a hash of the driver's bytes, so
 //! that no driver gets a damaged file, then the bytes. A file that cannot be read or written is as good as none.
 
+use crate::RunError;
 use etcetera::{BaseStrategy, choose_base_strategy};
 use std::path::PathBuf;
 
@@ -48,6 +49,42 @@ impl CacheFile {
             let _ = std::fs::remove_file(&part);
         }
     }
+}
+
+/// Lines of a file that are kept; the oldest go first.
+const KEPT: usize = 512;
+
+/// What a file of lines knows of a key; what is made, and kept, where it has no line of the key that `read` understands.
+pub(super) fn kept<T>(
+    open: impl Fn() -> (CacheFile, Vec<u8>),
+    key: &str,
+    read: impl Fn(&str) -> Option<T>,
+    write: impl Fn(&T) -> String,
+    make: impl FnOnce() -> Result<T, RunError>,
+) -> Result<T, RunError> {
+    let known = |held: &[u8]| lines(held).into_iter().find(|l| l.0 == key).and_then(|l| read(&l.1));
+    if let Some(value) = known(&open().1) {
+        return Ok(value);
+    }
+    let made = make()?;
+    // Others may have added theirs in the meantime, even one of this key.
+    let (file, held) = open();
+    if let Some(value) = known(&held) {
+        return Ok(value);
+    }
+    let mut all = lines(&held);
+    all.retain(|l| l.0 != key);
+    all.push((key.to_string(), write(&made)));
+    let first = all.len().saturating_sub(KEPT);
+    let text: String = all[first..].iter().map(|(key, value)| format!("{key} {value}\n")).collect();
+    file.save(text.as_bytes());
+    Ok(made)
+}
+
+/// Keys, and what is said of them.
+fn lines(held: &[u8]) -> Vec<(String, String)> {
+    let one = |line: &str| line.split_once(' ').map(|(key, value)| (key.to_string(), value.to_string()));
+    String::from_utf8_lossy(held).lines().filter_map(one).collect()
 }
 
 #[cfg(test)]

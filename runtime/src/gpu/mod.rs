@@ -4,6 +4,7 @@
 
 pub(crate) mod cache;
 pub(crate) mod half;
+pub(crate) mod rates;
 pub(crate) mod tune;
 
 use crate::device::Forms;
@@ -176,8 +177,9 @@ impl<A: Api> Executor for GpuExecutor<A> {
             return Err(RunError::Target(program.target.kind));
         }
         let Forms { half, tiles, .. } = self.forms;
-        let lowered = lower(&program, &mut self.inputs, &Limits { half, tiles, ..self.api.limits() })
-            .map_err(|e| self.lower_error(e))?;
+        let workgroups = program.target.rates.workgroups;
+        let limits = Limits { half, tiles, workgroups, ..self.api.limits() };
+        let lowered = lower(&program, &mut self.inputs, &limits).map_err(|e| self.lower_error(e))?;
         for arena in &self.inputs.arenas[self.arenas.len()..] {
             self.arenas.push(self.api.buffer(arena)?);
         }

@@ -1,13 +1,11 @@
 //! Which tiles, or which of two programs, run a step fastest, by running it.
 
-use super::cache::CacheFile;
+use super::cache::{CacheFile, kept};
 use crate::{Device, Forms, RunError, Session};
 use raygrad_compiler::Program;
 use raygrad_kernels::gpu::TILES;
 use std::time::Instant;
 
-/// Results that are kept; the oldest go first.
-const KEPT: usize = 512;
 /// Runs of a choice that are timed, after one that is not; the fastest counts.
 const ROUNDS: usize = 5;
 
@@ -40,34 +38,17 @@ fn chosen(
     seconds: impl Fn(usize) -> Result<f64, RunError>,
     open: impl Fn() -> (CacheFile, Vec<u8>),
 ) -> Result<usize, RunError> {
-    if let Some(known) = choices(&open().1).into_iter().find(|c| c.0 == *key && c.1 < count) {
-        return Ok(known.1);
-    }
-    let mut best = (f64::INFINITY, 0);
-    for choice in 0..count {
-        let seconds = seconds(choice)?;
-        if seconds < best.0 {
-            best = (seconds, choice);
+    let fastest = || {
+        let mut best = (f64::INFINITY, 0);
+        for choice in 0..count {
+            let seconds = seconds(choice)?;
+            if seconds < best.0 {
+                best = (seconds, choice);
+            }
         }
-    }
-    // Others may have added theirs in the meantime.
-    let (file, held) = open();
-    let mut all = choices(&held);
-    all.retain(|c| c.0 != *key);
-    all.push((key.to_string(), best.1));
-    let first = all.len().saturating_sub(KEPT);
-    let lines: String = all[first..].iter().map(|(key, choice)| format!("{key} {choice}\n")).collect();
-    file.save(lines.as_bytes());
-    Ok(best.1)
-}
-
-/// Lines of a key and a choice.
-fn choices(held: &[u8]) -> Vec<(String, usize)> {
-    let one = |line: &str| {
-        let (key, choice) = line.split_once(' ')?;
-        Some((key.to_string(), choice.parse().ok()?))
+        Ok(best.1)
     };
-    String::from_utf8_lossy(held).lines().filter_map(one).collect()
+    kept(open, key, |text| text.parse().ok().filter(|c| *c < count), usize::to_string, fastest)
 }
 
 /// A hash of all that a choice depends on.
@@ -117,16 +98,16 @@ mod tests {
         let path = folder.path().join("tuned.bin");
         let open = || CacheFile::at(Some(path.clone()));
         let first = tuned_with(device.clone(), &program(256), open).unwrap().forms();
-        let held = choices(&open().1);
-        let key = |rows: usize| key(&device.clone().with_forms(Forms::default()), &[program(rows)]);
-        assert_eq!(held, [(key(256), first.tiles as usize)]);
+        let held = || String::from_utf8(open().1).unwrap();
+        let untuned = device.clone().with_forms(Forms { tiles: 0, ..device.forms() });
+        let key = |rows: usize| key(&untuned, &[program(rows)]);
+        assert_eq!(held(), format!("{} {}\n", key(256), first.tiles));
         // What is kept is believed.
         let other = (first.tiles + 1) % TILES;
-        open().0.save(format!("{} {other}\nnonsense\n{} 99\n", held[0].0, key(128)).as_bytes());
+        open().0.save(format!("{} {other}\nnonsense\n{} 99\n", key(256), key(128)).as_bytes());
         assert_eq!(tuned_with(device.clone(), &program(256), open).unwrap().forms().tiles, other);
-        tuned_with(device.clone(), &program(128), open).unwrap();
-        let made = choices(&open().1);
-        assert_eq!(made.iter().map(|c| c.0.clone()).collect::<Vec<_>>(), [key(256), key(128)]);
+        let second = tuned_with(device.clone(), &program(128), open).unwrap().forms().tiles;
+        assert_eq!(held(), format!("{} {other}\n{} {second}\n", key(256), key(128)));
     }
 
     /// The program that takes less time is chosen, and once.

@@ -111,8 +111,7 @@ impl Gpu {
                 max_buffers: properties.limits.max_per_stage_descriptor_storage_buffers,
                 max_workgroups: properties.limits.max_compute_work_group_count[0],
                 max_workgroup_bytes: properties.limits.max_compute_shared_memory_size,
-                tiles: 0,
-                half: None,
+                ..Limits::default()
             };
             let clock = (bits > 0).then(|| Clock {
                 seconds_per_tick: 1e-9 * f64::from(properties.limits.timestamp_period),

@@ -83,8 +83,7 @@ impl Gpu {
             max_buffers: limits.max_storage_buffers_per_shader_stage,
             max_workgroups: limits.max_compute_workgroups_per_dimension,
             max_workgroup_bytes: limits.max_compute_workgroup_storage_size,
-            tiles: 0,
-            half: None,
+            ..Limits::default()
         };
         let key = api::util::pipeline_cache_key(&adapter.get_info());
         let cache = key.filter(|_| device.features().contains(api::Features::PIPELINE_CACHE)).map(|key| {

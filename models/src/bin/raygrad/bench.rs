@@ -71,6 +71,8 @@ struct Launch {
     /// Of what it computes, and of every buffer it touches, once.
     gflop: f64,
     gbytes: f64,
+    /// By the cost model.
+    predicted_seconds: f64,
 }
 
 const WARM_UP: usize = 3;
@@ -139,7 +141,11 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
         peak_rss_mb,
         host_seconds_per_step: host,
         peak_gbytes,
-        per_launch: if args.launches { launches(program, &of_lanes, &profiled) } else { vec![] },
+        per_launch: if args.launches {
+            launches(program, &of_lanes, &device.predicted(program), &profiled)
+        } else {
+            vec![]
+        },
     };
     if args.json {
         print(&format!("{}\n", serde_json::to_string(&result)?))?;
@@ -191,12 +197,13 @@ fn profile(trainer: &mut dyn Training) -> anyhow::Result<Vec<Vec<f64>>> {
     Ok(steps)
 }
 
-fn launches(program: &Program, of_lanes: &[u64], profiled: &[Vec<f64>]) -> Vec<Launch> {
+fn launches(program: &Program, of_lanes: &[u64], predicted: &[f64], profiled: &[Vec<f64>]) -> Vec<Launch> {
     let one = |(i, launch): (usize, &raygrad_compiler::plan::Launch)| Launch {
         name: launch.name.clone(),
         seconds: median(&profiled.iter().map(|step| step[i]).collect::<Vec<_>>()),
         gflop: launch.region.flops() as f64 * 1e-9,
         gbytes: program.launch_bytes_of(i, |b| of_lanes[b.0 as usize]) as f64 * 1e-9,
+        predicted_seconds: predicted[i],
     };
     program.launches.iter().enumerate().map(one).collect()
 }
@@ -205,14 +212,20 @@ fn launches(program: &Program, of_lanes: &[u64], profiled: &[Vec<f64>]) -> Vec<L
 fn write_launches(text: &mut String, launches: &[Launch], peak: f64, peak_gbytes: f64) -> std::fmt::Result {
     let total: f64 = launches.iter().map(|l| l.seconds).sum();
     let width = launches.iter().map(|l| l.name.len()).max().unwrap_or(0).max(6);
-    writeln!(text, "\n{:width$}  {:>9}  {:>6}  {:>16}  {:>14}", "launch", "ms", "share", "GFLOP/s", "GB/s")?;
+    let predicted: f64 = launches.iter().map(|l| l.predicted_seconds).sum();
+    writeln!(
+        text,
+        "\n{:width$}  {:>9}  {:>9}  {:>6}  {:>16}  {:>14}",
+        "launch", "ms", "predicted", "share", "GFLOP/s", "GB/s"
+    )?;
     for l in launches {
         let (flops, bytes) = (l.gflop / l.seconds.max(1e-9), l.gbytes / l.seconds.max(1e-9));
         writeln!(
             text,
-            "{:width$}  {:>9.3}  {:>4.0} %  {:>9.1} ({:>2.0} %)  {:>7.1} ({:>2.0} %)",
+            "{:width$}  {:>9.3}  {:>9.3}  {:>4.0} %  {:>9.1} ({:>2.0} %)  {:>7.1} ({:>2.0} %)",
             l.name,
             1e3 * l.seconds,
+            1e3 * l.predicted_seconds,
             100.0 * l.seconds / total,
             flops,
             100.0 * flops / peak,
@@ -222,9 +235,10 @@ fn write_launches(text: &mut String, launches: &[Launch], peak: f64, peak_gbytes
     }
     writeln!(
         text,
-        "{:width$}  {:>9.3}          {:>9.1} at best   {:>7.1} at best",
+        "{:width$}  {:>9.3}  {:>9.3}          {:>9.1} at best   {:>7.1} at best",
         "all",
         1e3 * total,
+        1e3 * predicted,
         peak,
         peak_gbytes
     )
