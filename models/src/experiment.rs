@@ -229,7 +229,7 @@ impl Experiment {
         let run = &self.layered.settings.run;
         let device = match &self.device {
             Some(device) => device.clone(),
-            None => open_device(run.device, run.threads.limit())?,
+            None => open_device(run.device, run.threads.limit())?.measured()?,
         };
         Ok(device.with_precision(precision.into())?)
     }

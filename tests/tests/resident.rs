@@ -4,6 +4,7 @@
 use raygrad::config::{Layered, Networks};
 use raygrad::training::Learner;
 use raygrad_compiler::autodiff::grad;
+use raygrad_compiler::cost::Rates;
 use raygrad_compiler::functions::composite::{Composite, composite_above};
 use raygrad_compiler::functions::mlp::Activation;
 use raygrad_compiler::functions::posenc::positional_encoding;
@@ -13,7 +14,7 @@ use raygrad_compiler::plan::region::{Grain, RegionOp};
 use raygrad_compiler::reference::{Array, Bindings};
 use raygrad_compiler::{Program, Step, Target, compile};
 use raygrad_kernels::gpu::{GpuLaunch, Inputs, Kernel, Limits, lower};
-use raygrad_runtime::Device;
+use raygrad_runtime::{Device, Forms};
 use raygrad_tests::backend::{gpus, reference, resident, run};
 use raygrad_tests::check::check;
 use raygrad_tests::rendering::{Rendering, Sizes};
@@ -123,21 +124,25 @@ fn gradients() {
     }
 }
 
-/// What a run asks for, and that a CPU has no such forms.
+/// What a run asks for, else what should be faster by the device's rates; and that a CPU has no such forms.
 #[test]
 fn a_setting_decides() {
-    let network = Network::new((3, 64), [20, 20, 20], false);
+    let network = Network::new((3, 64), [100, 100, 100], false);
     let mut settings = Layered::load("planar-barf").unwrap_or_else(|e| panic!("{e}")).settings;
-    for (device, on_gpu) in
-        std::iter::once((Device::cpu(Some(1)).unwrap(), false)).chain(gpus().into_iter().map(|d| (d, true)))
-    {
-        for (networks, wanted) in [(Networks::Auto, false), (Networks::Layered, false), (Networks::Resident, true)] {
-            settings.run.networks = networks;
-            let (learner, program) =
-                Learner::new(device.clone(), &settings, &network.values()).unwrap_or_else(|e| panic!("{e}"));
-            let launches = &learner.program(program).launches;
-            let found = launches.iter().any(|l| l.region.grain == Grain::Tile);
-            assert_eq!(found, wanted && on_gpu, "{networks:?} on {}", device.name());
+    let mut found = |device: &Device, networks: Networks| {
+        settings.run.networks = networks;
+        let (learner, program) =
+            Learner::new(device.clone(), &settings, &network.values()).unwrap_or_else(|e| panic!("{e}"));
+        learner.program(program).launches.iter().any(|l| l.region.grain == Grain::Tile)
+    };
+    let all = [Networks::Auto, Networks::Layered, Networks::Resident];
+    assert_eq!(all.map(|n| found(&Device::cpu(Some(1)).unwrap(), n)), [false; 3]);
+    for device in gpus() {
+        // Where launches cost next to nothing, layers of their own reach more of the device.
+        for (launch_ns, auto) in [(3_000, true), (1, false)] {
+            let rates = Rates { launch_ns, ..Rates::GPU };
+            let device = device.clone().with_forms(Forms { rates, ..device.forms() });
+            assert_eq!(all.map(|n| found(&device, n)), [auto, false, true], "{} at {launch_ns} ns", device.name());
         }
     }
 }

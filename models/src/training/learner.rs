@@ -29,10 +29,9 @@ pub struct Learner {
 }
 
 impl Learner {
-    /// Compiles a training step for a device, by its rates; with `run.autotune` for the tiles, and each program for the form of its
-    /// networks, that are fastest there.
+    /// Compiles a training step for a device; with `run.autotune` for the tiles, and each program for the form of its networks,
+    /// that are fastest there.
     pub fn new(device: Device, settings: &Settings, step: &Step) -> Result<(Learner, ProgramId), Error> {
-        let device = device.measured()?;
         let device = match settings.run.autotune {
             true => device.clone().tuned(&compile(step, &device.target())?)?,
             false => device,
