@@ -112,7 +112,7 @@ impl Target {
             // In single precision. A multiply-add takes as many bytes of workgroup memory as a processor reads in the time of
             // three; not measured.
             (_, Grain::Tile) => 0.35 * single.min(best),
-            _ if best > single => 0.2 * best,
+            _ if best > single => 0.16 * best,
             _ => 0.7 * best,
         };
         // An instruction takes the place of a multiply-add; a CPU passes its lanes through the first cache.
@@ -174,6 +174,6 @@ mod tests {
         near(seconds(1 << 20, 16, rates), (1u64 << 20) as f64 * 2.0 * 64.0 / 0.8e11);
         near(seconds(1, 4, rates), 1e-6);
         let halves = Rates { product_gflops: 8000, ..rates };
-        near(seconds(1 << 20, 256, halves), (1u64 << 20) as f64 * 2.0 * 65536.0 / 1.6e12);
+        near(seconds(1 << 20, 256, halves), (1u64 << 20) as f64 * 2.0 * 65536.0 / 1.28e12);
     }
 }

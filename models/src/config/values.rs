@@ -274,7 +274,7 @@ impl From<Precision> for raygrad_runtime::Precision {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Networks {
-    /// As `Layered`; with `run.autotune` as is faster, of each program.
+    /// Of each program what should be clearly faster by the device's rates, else as `Layered`; with `run.autotune` what is faster.
     #[default]
     Auto,
     /// A layer is a launch.
