@@ -116,7 +116,7 @@ impl Target {
             _ => 0.7 * best,
         };
         // An instruction takes the place of a multiply-add; a CPU passes its lanes through the first cache.
-        let others = if self.kind == TargetKind::Cpu { 0.2 * single } else { 0.25 * single };
+        let others = if self.kind == TargetKind::Cpu { 0.1 * single } else { 0.25 * single };
         (work.products as f64 / products + work.others as f64 / others) * 1e-9
     }
 
