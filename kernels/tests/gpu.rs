@@ -99,6 +99,23 @@ fn kernels_in_half_precision_keep_to_the_limits() {
     }
 }
 
+/// Work is cut into as many workgroups as the device is said to need, for layers and for sums over rows.
+#[test]
+fn work_is_cut_for_the_processors_of_a_device() {
+    let program = network();
+    let count = |workgroups: u32, name: &str| {
+        let limits = Limits { workgroups, ..Limits::default() };
+        let kernels = lowered(&program, &limits, "network")
+            .into_iter()
+            .filter(|k| k.name.split('.').any(|part| part.ends_with(name)));
+        kernels.map(|k| k.workgroups.iter().product::<u32>()).max().unwrap_or(0)
+    };
+    for name in ["layer", "outer"] {
+        let (few, many) = (count(4, name), count(4096, name));
+        assert!(0 < few && few < many, "{name}: {few}, {many}");
+    }
+}
+
 /// What lies between launches is stored as halves where a product reads it, and nothing else is.
 #[test]
 fn halves_are_what_products_read() {

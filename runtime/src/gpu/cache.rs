@@ -91,6 +91,28 @@ fn lines(held: &[u8]) -> Vec<(String, String)> {
 mod tests {
     use super::*;
 
+    /// What another process has found in the meantime counts, so that both go on with the same; lines of other keys stay.
+    #[test]
+    fn the_first_answer_is_kept() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("lines.bin");
+        let open = || CacheFile::at(Some(path.clone()));
+        let ask = |key: &str, made: usize, others: &str| {
+            let make = || {
+                if !others.is_empty() {
+                    open().0.save(others.as_bytes());
+                }
+                Ok(made)
+            };
+            kept(open, key, |text| text.parse().ok(), usize::to_string, make).unwrap()
+        };
+        assert_eq!(ask("a", 1, ""), 1);
+        assert_eq!(ask("a", 2, ""), 1);
+        assert_eq!(ask("b", 3, "a 1\nb 4\n"), 4);
+        assert_eq!(ask("c", 5, "a 1\nb 4\nc nonsense\n"), 5);
+        assert_eq!(open().1, b"a 1\nb 4\nc 5\n");
+    }
+
     #[test]
     fn keeps_what_it_gets_and_trusts_no_damaged_file() {
         let folder = tempfile::tempdir().unwrap();
