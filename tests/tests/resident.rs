@@ -144,6 +144,8 @@ fn a_setting_decides() {
             let device = device.clone().with_forms(Forms { rates, ..device.forms() });
             assert_eq!(all.map(|n| found(&device, n)), [auto, false, true], "{} at {launch_ns} ns", device.name());
         }
+        let device = device.clone().with_forms(Forms { rates: Rates::SOFTWARE, ..device.forms() });
+        assert!(!found(&device, Networks::Auto), "{} with the rates of software", device.name());
     }
 }
 

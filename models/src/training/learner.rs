@@ -69,6 +69,10 @@ impl Learner {
         if self.autotune {
             return Ok(self.device.faster([layered, resident])?);
         }
+        // A driver in software takes minutes to compile kernels of so many barriers.
+        if target.rates == raygrad_compiler::cost::Rates::SOFTWARE.single() {
+            return Ok(layered);
+        }
         let seconds = |program: &Program| self.device.predicted(program).iter().sum::<f64>();
         Ok(if CLEARLY * seconds(&resident) < seconds(&layered) { resident } else { layered })
     }
