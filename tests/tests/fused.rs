@@ -128,6 +128,21 @@ fn parameters_that_take_each_others_lanes() {
     inputs.check(&[], &[(&q, &(&q * &r - &g.pick(&rotated))), (&r, &(&r * q.sum_channels()))]);
 }
 
+/// Many channels that are written and of which few are made: without staging, one invocation would compute all of them.
+#[test]
+fn sums_of_many_channels_that_are_written_too() {
+    let mut inputs = Inputs::new("sums of many");
+    let parts = [2, 128].map(|n| inputs.parameter(&format!("part {n}"), Shape::new(&[], (n, 16))).reshape(16 * n));
+    let [p, q] = ["p", "q"].map(|n| inputs.parameter(n, Shape::new(&[], 2080)));
+    let every = |n: u32| (0..n).map(|first| (first..2080).step_by(n as usize).collect()).collect();
+    let whole = (concat(&parts) + &p).sin();
+    let few = (&whole * &whole).channel_groups(every(64));
+    inputs.check(&[&whole, &few, &(&few + whole.slice(100..164))], &[]);
+    // One that replaces what the sums' other operands are made of.
+    let replaced = &q * 0.5;
+    inputs.check(&[&whole, &(&replaced * &q).channel_groups(every(64))], &[(&q, &replaced)]);
+}
+
 #[test]
 fn states_that_read_other_elements_of_themselves() {
     let (frame, ray) = (Axis::new("frame", 3), Axis::new("ray", 300));

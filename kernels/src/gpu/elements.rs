@@ -15,9 +15,9 @@ use raygrad_compiler::plan::region::{BufferId, InstId, Region, RegionOp, Store};
 use raygrad_compiler::scalar::DType;
 
 /// Elements from which rows alone fill a device.
-const MANY: usize = 4096;
+pub(super) const MANY: usize = 4096;
 /// Most channels that are unrolled.
-const WIDE: usize = 64;
+pub(super) const WIDE: usize = 64;
 /// Instructions from which unrolling is worth avoiding.
 const LONG: usize = 2000;
 /// Elements from which four a time still fill a device.

@@ -3,9 +3,10 @@
 //! Products of small matrices in a row (the gradient of an eigen-decomposition has dozens) are thousands of instructions
 //! when an invocation computes all channels, and as many more when every channel is computed by itself from the start. So
 //! a sum of channels that feeds another one is written to memory, and a stage computes channels each by itself from there.
+//! So does a value of many channels that is written anyway, before what sums or picks of them.
 
 use super::LowerError;
-use super::elements::{closure, own_cost};
+use super::elements::{self, closure, own_cost};
 use super::layout::Layout;
 use super::parts::replace_by_load;
 use raygrad_compiler::graph::Shape;
@@ -40,6 +41,7 @@ pub(super) fn stages(layout: &mut Layout, region: Region) -> Result<Vec<Region>,
         }
         sources[i] = from;
     }
+    own_stages(&region).iter().for_each(|value| through_memory[value.0 as usize] = true);
     let mut stage = vec![0usize; region.body.len()];
     for i in body() {
         let after = |x: &InstId| stage[x.0 as usize] + usize::from(through_memory[x.0 as usize]);
@@ -56,7 +58,11 @@ pub(super) fn stages(layout: &mut Layout, region: Region) -> Result<Vec<Region>,
             let shape = Shape::of(inst.axes.clone(), inst.channels, inst.dtype);
             let whole = inst.axes == region.domain;
             let shape = if whole { shape } else { shape.with_axes(region.domain.clone()) };
-            let buffer = layout.scratch(&inst.label, shape)?;
+            let buffer = match written_by(&region, value) {
+                Some(buffer) => buffer,
+                None => layout.scratch(&inst.label, shape)?,
+            };
+            rest.stores.retain(|s| s.buffer() != buffer);
             own.stores.push(Store::Write { value, buffer });
             written.push((value, buffer));
         }
@@ -69,6 +75,27 @@ pub(super) fn stages(layout: &mut Layout, region: Region) -> Result<Vec<Region>,
     }
     all.push(rest.swept());
     Ok(all)
+}
+
+/// Where a value is written and may be read by a later stage.
+fn written_by(region: &Region, value: InstId) -> Option<BufferId> {
+    let written = region.stores.iter().find(|s| s.values()[0] == value)?;
+    (!region.reads().contains(&written.buffer())).then(|| written.buffer())
+}
+
+/// Written values of few elements and more channels than are unrolled, of which a value with other channels is made: an
+/// invocation that computed both would go through all channels one by one.
+fn own_stages(region: &Region) -> Vec<InstId> {
+    let of = |store: &Store| store.values()[0];
+    let channels = |store: &Store| region.inst(of(store)).channels;
+    let needed = |value: InstId, by: &Store| closure(region, by.values())[value.0 as usize];
+    let staged = |s: &&Store| {
+        channels(s) > elements::WIDE
+            && written_by(region, of(s)).is_some()
+            && region.stores.iter().any(|by| channels(by) != channels(s) && needed(of(s), by))
+    };
+    let few = region.domain.elements() < elements::MANY;
+    region.stores.iter().filter(|_| few).filter(staged).map(of).collect()
 }
 
 /// Eigen-decompositions that a scan's region needs and that need no scan themselves: as a stage before it, and the rest.
