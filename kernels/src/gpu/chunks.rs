@@ -1,11 +1,15 @@
 //! Partial results of chunks of rows, combined in order by a kernel of their own.
 
+use super::builder::Value;
 use super::layout::{Layout, Limits};
 use super::memory::Emit;
 use super::reduce::{combine, neutral};
 use super::{Kernel, LowerError};
 use raygrad_compiler::ops::Reduction;
 use raygrad_compiler::plan::region::BufferId;
+
+/// Chunks that are read before they are combined.
+const TOGETHER: u32 = 8;
 
 /// Lanes `first..first + lanes` of a buffer, as one stretch of a chunk's partial results.
 pub(super) struct End {
@@ -39,16 +43,29 @@ pub(super) fn finish(
     let sum = |e: &mut Emit, kind: Reduction| {
         let start = neutral(&mut e.b, kind);
         let total = e.b.var("total", start);
-        let (from, to) = (e.b.u(0), e.b.u(chunks as u32));
-        let chunk = e.b.open_loop("chunk", from, to, 1);
-        let stride = e.b.u(per_chunk as u32);
-        let at = e.b.mul(chunk, stride);
-        let at = e.b.add(at, number);
-        let next = e.load(partials, at);
-        let so_far = e.b.get(total);
-        let next = combine(&mut e.b, kind, so_far, next);
-        e.b.set(total, next);
-        e.b.close_loop();
+        // Several are on their way from memory while they are combined in order.
+        let some = |e: &mut Emit, first: Value, count: u32| {
+            let loads: Vec<Value> = (0..count)
+                .map(|i| {
+                    let (offset, stride) = (e.b.u(i), e.b.u(per_chunk as u32));
+                    let chunk = e.b.add(first, offset);
+                    let at = e.b.mul(chunk, stride);
+                    let at = e.b.add(at, number);
+                    e.load(partials, at)
+                })
+                .collect();
+            let so_far = e.b.get(total);
+            let after = loads.into_iter().fold(so_far, |sum, next| combine(&mut e.b, kind, sum, next));
+            e.b.set(total, after);
+        };
+        let rest = chunks as u32 % TOGETHER;
+        let (from, to) = (e.b.u(0), e.b.u(chunks as u32 - rest));
+        if chunks as u32 >= TOGETHER {
+            let chunk = e.b.open_loop("chunk", from, to, TOGETHER);
+            some(e, chunk, TOGETHER);
+            e.b.close_loop();
+        }
+        some(e, to, rest);
         e.b.get(total)
     };
     let mut from = 0;

@@ -146,7 +146,7 @@ pub(super) fn totals(layout: &mut Layout, region: &Region, parts: usize) -> Resu
     Ok(all)
 }
 
-/// Loads of the region that the values after a layer use channel by channel.
+/// Loads of the region that the values after a layer use channel by channel, and little layers that are added to it.
 pub(super) fn loads(region: &Region, linear: InstId) -> Vec<InstId> {
     let mut needed = vec![false; region.body.len()];
     region.stores.iter().flat_map(|s| s.values()).for_each(|v| needed[v.0 as usize] = true);
@@ -154,7 +154,8 @@ pub(super) fn loads(region: &Region, linear: InstId) -> Vec<InstId> {
     for at in (0..region.body.len()).rev().filter(|at| InstId(*at as u32) != linear) {
         let inst = &region.body[at];
         match inst.op {
-            RegionOp::Load(_) if needed[at] => loads.push(InstId(at as u32)),
+            // A layer of few terms: its operands' loads.
+            RegionOp::Load(_) | RegionOp::Linear(_) if needed[at] => loads.push(InstId(at as u32)),
             // A part of a buffer.
             RegionOp::Pick(_)
                 if needed[at]

@@ -15,13 +15,16 @@ use raygrad_compiler::plan::region::{BufferId, Region, RegionOp, Store};
 use raygrad_compiler::scalar::DType;
 use std::ops::Range;
 
-/// Workgroups of large tiles for a processor, and of smaller ones.
+/// Sums of a tile that leave a processor no room for another.
+const WHOLE: u32 = 128 * 256;
+/// Workgroups for a processor: of those, of large tiles, and of smaller ones.
+const EACH_WHOLE: usize = 1;
 const EACH: usize = 2;
 const EACH_SMALL: usize = 4;
 /// Rows of a chunk, at least.
 const CHUNK_ROWS: usize = 64;
 /// Chunks, at most.
-const MAX_CHUNKS: usize = 128;
+const MAX_CHUNKS: usize = 256;
 
 /// Kernels for a region with one `Outer` store of loaded values.
 pub(super) fn kernels(
@@ -40,10 +43,12 @@ pub(super) fn kernels(
     let side = |buffer: BufferId, channels: usize| Side { buffer, channels: 0..channels };
     let (inputs, outputs) = (region.inst(*x).channels, region.inst(*d).channels);
     // Four neighbouring m are one vector, and so should neighbouring outputs be; but narrow tiles are narrow along n.
-    let swapped = outputs > 32;
+    let products = kept * rows.div_ceil(CHUNK_ROWS).min(MAX_CHUNKS);
+    // Nor should tiles be padded much.
+    let time = |m, n| Tile::timed(&limits, (m, n, rows), products).1;
+    let swapped = outputs > 32 && (inputs <= 32 || time(outputs, inputs) < 1.2 * time(inputs, outputs));
     let (x, d) = (side(*x_buffer, inputs), side(*d_buffer, outputs));
     let (m, n) = if swapped { (d, x) } else { (x, d) };
-    let products = kept * rows.div_ceil(CHUNK_ROWS).min(MAX_CHUNKS);
     let mut parts: Vec<Part> = vec![];
     for n_channels in split(n.channels.len()) {
         for m_channels in split(m.channels.len()) {
@@ -56,7 +61,12 @@ pub(super) fn kernels(
     }
     // All parts have the same chunks, so that one kernel sums them.
     let groups: usize = parts.iter().map(|p| p.tiles() * kept).max().unwrap_or(1);
-    let each = if parts.iter().any(|p| p.tile.invocations() > 64) { EACH } else { EACH_SMALL };
+    let any = |f: fn(&Tile) -> bool| parts.iter().any(|p| f(&p.tile));
+    let each = match () {
+        _ if any(|t| t.m * t.n >= WHOLE) => EACH_WHOLE,
+        _ if any(|t| t.invocations() > 64) => EACH,
+        _ => EACH_SMALL,
+    };
     let enough = each * limits.workgroups as usize;
     let wanted = enough.div_ceil(groups).min(rows.div_ceil(CHUNK_ROWS)).min(MAX_CHUNKS);
     let depth = parts.iter().map(|p| p.tile.k).max().unwrap_or(1) as usize;

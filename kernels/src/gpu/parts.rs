@@ -409,8 +409,7 @@ impl Homes {
             let (at, inst) = (id.0 as usize, region.inst(id));
             let level = inst.inputs.iter().filter_map(|i| homes.level[i.0 as usize]).max();
             homes.level[at] = level;
-            let x_in_memory = || matches!(region.inst(inst.inputs[0]).op, RegionOp::Load(_));
-            if matches!(inst.op, RegionOp::Linear(_)) && x_in_memory() {
+            if is_layer(region, id) && !is_little(region, id) {
                 homes.home[at] = Some(homes.layers.len());
                 homes.level[at] = homes.home[at];
                 homes.layers.push(id);
@@ -444,6 +443,25 @@ impl Homes {
         }
         homes
     }
+}
+
+/// Terms of a layer that the epilogue of another may compute.
+const LITTLE: usize = 4;
+
+/// Whether a value is a product with weights that has a kernel.
+fn is_layer(region: &Region, id: InstId) -> bool {
+    let inst = region.inst(id);
+    matches!(inst.op, RegionOp::Linear(_)) && matches!(region.inst(inst.inputs[0]).op, RegionOp::Load(_))
+}
+
+/// Whether a layer has so few terms that the epilogue of the one it is added to computes it.
+fn is_little(region: &Region, id: InstId) -> bool {
+    let terms = |id: InstId| region.inst(region.inst(id).inputs[0]).channels;
+    let beside = |other: &InstId| *other != id && is_layer(region, *other) && terms(*other) > LITTLE;
+    let users = || region.body.iter().filter(|user| user.inputs.contains(&id));
+    terms(id) <= LITTLE
+        && !region.stores.iter().any(|s| s.values().contains(&id))
+        && users().all(|user| matches!(user.op, RegionOp::Map(_)) && user.inputs.iter().any(beside))
 }
 
 /// Redirects writes that replace a buffer which a later part, or another invocation of the same part, still reads.

@@ -166,7 +166,7 @@ struct Reducer<'r> {
     over: Axes,
     /// Channels that are a dimension of the dispatch.
     channels: usize,
-    /// Whether invocations of a chunk take four rows at a time.
+    /// Whether invocations take four rows at a time.
     fours: bool,
 }
 
@@ -197,6 +197,16 @@ impl Reducer<'_> {
         }
     }
 
+    /// What an invocation found for a target.
+    fn total(&self, e: &mut Emit, target: &Target, total: Var) -> Value {
+        let value = e.b.get(total);
+        if !self.fours {
+            return value;
+        }
+        let lanes = [0, 1, 2, 3].map(|i| e.b.component(value, i));
+        combine_all(&mut e.b, target.kind, &lanes)
+    }
+
     fn buffer(&self, t: &Target) -> BufferId {
         self.region.stores[t.store].buffer()
     }
@@ -210,16 +220,17 @@ impl Reducer<'_> {
     /// An invocation a result.
     fn alone(&self, layout: &Layout, limits: Limits, name: &str) -> Result<Kernel, LowerError> {
         let kept_elements = self.keep.elements() as u32;
-        let (mut e, number) = Emit::over(layout, limits, kept_elements as u64 * self.channels as u64)?;
+        let (e, number) = Emit::over(layout, limits, kept_elements as u64 * self.channels as u64)?;
+        let mut e = e.with_vectors(self.fours);
         let per_channel = e.b.u(kept_elements);
         let (channel, kept) = (e.b.div(number, per_channel), e.b.rem(number, per_channel));
-        let totals = self.start(&mut e, false);
+        let totals = self.start(&mut e, self.fours);
         let (from, to) = (e.b.u(0), e.b.u(self.over.elements() as u32));
-        let row = e.b.open_loop("row", from, to, 1);
-        self.step(&mut e, false, &totals, (kept, channel, row));
+        let row = e.b.open_loop("row", from, to, if self.fours { 4 } else { 1 });
+        self.step(&mut e, self.fours, &totals, (kept, channel, row));
         e.b.close_loop();
         for (t, total) in self.targets.iter().zip(&totals) {
-            let value = e.b.get(*total);
+            let value = self.total(&mut e, t, *total);
             let at = self.index(&mut e, t, kept, channel);
             e.store(self.buffer(t), at, value);
         }
@@ -263,12 +274,7 @@ impl Reducer<'_> {
         let count = self.targets.len() as u32;
         let found = e.b.workgroup("found", Kind::F32, false, count * WORKGROUP);
         for (i, total) in totals.iter().enumerate() {
-            let mut value = e.b.get(*total);
-            if fours {
-                let lanes = [0, 1, 2, 3].map(|i| e.b.component(value, i));
-                let kind = self.targets[i].kind;
-                value = combine_all(&mut e.b, kind, &lanes);
-            }
+            let value = self.total(&mut e, &self.targets[i], *total);
             let first = e.b.u(i as u32 * WORKGROUP);
             let at = e.b.add(e.invocation, first);
             e.b.store(found, at, value);

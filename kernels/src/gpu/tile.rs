@@ -36,22 +36,30 @@ pub(super) struct Tile {
 
 impl Tile {
     /// The tile for products of `[m, k]` and `[k, n]`, so many of them, that takes the least time.
-    pub fn of(limits: &Limits, (m, n, k): (usize, usize, usize), products: usize) -> Tile {
-        // What a processor computes one after the other, at the tile's rate: at least one tile.
-        let time = |(t, rate): &(Tile, f64)| {
+    pub fn of(limits: &Limits, sizes: (usize, usize, usize), products: usize) -> Tile {
+        Tile::timed(limits, sizes, products).0
+    }
+
+    /// The same, with its time, which compares with that of other sizes: what a processor computes one after the other, at
+    /// least one tile, at the tile's rate.
+    pub fn timed(limits: &Limits, (m, n, k): (usize, usize, usize), products: usize) -> (Tile, f64) {
+        let time = |(t, rate): (Tile, f64)| {
             let workgroups = m.div_ceil(t.m as usize) * n.div_ceil(t.n as usize) * products;
             let each = (workgroups as f64 / f64::from(limits.workgroups)).max(1.0);
-            each * f64::from(t.m * t.n) / rate
+            (t, each * f64::from(t.m * t.n) / rate)
         };
         let fits = |t: &Tile| t.bytes() <= limits.max_workgroup_bytes && t.invocations() <= MOST_INVOCATIONS;
-        // Of tiles and their rates, relative to each other; the last one fits in any case.
-        let fastest = |all: &[(Tile, f64)]| {
-            let (last, larger) = (all[all.len() - 1], &all[..all.len() - 1]);
-            let others = larger.iter().skip(limits.tiles as usize).filter(|(t, _)| fits(t));
-            others.chain([&last]).min_by(|a, b| time(a).total_cmp(&time(b))).map_or(last.0, |(t, _)| *t)
-        };
+        let all = Tile::candidates(limits, (m, n, k));
+        // The last one fits in any case.
+        let (last, larger) = (all[all.len() - 1], &all[..all.len() - 1]);
+        let others = larger.iter().skip(limits.tiles as usize).filter(|(t, _)| fits(t));
+        others.chain([&last]).map(|t| time(*t)).min_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or(time(last))
+    }
+
+    /// Tiles and their rates, relative to each other.
+    fn candidates(limits: &Limits, (m, n, k): (usize, usize, usize)) -> Vec<(Tile, f64)> {
         if limits.tiles == SOFTWARE_TILES && n > 16 {
-            return Tile::direct(m, n, k);
+            return vec![(Tile::direct(m, n, k), 1.0)];
         }
         if let Some(matrices) = limits.matrices()
             && n > 32
@@ -63,12 +71,12 @@ impl Tile {
                 let (own_m, own_n) = (own_m * side, own_n * side);
                 Tile { m, n, k: 32, own_m, own_n, matrices: Some(matrices), direct: false }
             };
-            let smallest = (tile(64, 64, (2, 2)), 0.7);
+            let smallest = (tile(64, 64, (2, 2)), 0.5);
             return match n {
-                0..=64 => fastest(&[(tile(128, 64, (2, 2)), 0.8), smallest]),
-                65..=128 => fastest(&[(tile(256, 128, (4, 4)), 1.0), (tile(64, 128, (2, 4)), 0.8), smallest]),
+                0..=64 => vec![(tile(128, 64, (4, 2)), 0.8), smallest],
+                65..=128 => vec![(tile(256, 128, (4, 4)), 1.0), (tile(64, 128, (2, 4)), 0.8), smallest],
                 // All columns at once: the other operand is then read once.
-                _ => fastest(&[(tile(128, 256, (4, 4)), 1.0), (tile(64, 128, (2, 4)), 0.8), smallest]),
+                _ => vec![(tile(128, 256, (4, 4)), 1.0), (tile(64, 128, (2, 4)), 0.8), smallest],
             };
         }
         let deep = match k {
@@ -80,17 +88,17 @@ impl Tile {
         };
         let tile = |m, n, k, own_m, own_n| Tile { m, n, k, own_m, own_n, matrices: None, direct: false };
         match n {
-            0..=4 => tile(256, 4, deep, 4, 4),
-            5..=8 => tile(128, 8, deep, 4, 4),
-            9..=16 => tile(128, 16, deep, 8, 4),
-            17..=32 => tile(64, 32, deep, 8, 4),
+            0..=4 => vec![(tile(256, 4, deep, 4, 4), 1.0)],
+            5..=8 => vec![(tile(128, 8, deep, 4, 4), 1.0)],
+            9..=16 => vec![(tile(128, 16, deep, 8, 4), 1.0)],
+            17..=32 => vec![(tile(64, 32, deep, 8, 4), 1.0)],
             _ => {
                 // Long sums write little.
                 let largest = match k >= LONG {
                     true => (tile(128, 128, deep, 8, 8), 1.0),
                     false => (tile(128, 64, deep.min(8), 8, 8), 0.9),
                 };
-                fastest(&[largest, (tile(64, 64, deep, 8, 8), 0.84), (tile(32, 32, deep, 4, 4), 0.5)])
+                vec![largest, (tile(64, 64, deep, 8, 8), 0.84), (tile(32, 32, deep, 4, 4), 0.5)]
             }
         }
     }

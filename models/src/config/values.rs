@@ -274,7 +274,8 @@ impl From<Precision> for raygrad_runtime::Precision {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Networks {
-    /// Of each program what should be clearly faster by the device's rates, else as `Layered`; with `run.autotune` what is faster.
+    /// As `Resident`, unless `Layered` should be clearly faster by the device's rates; with `run.autotune` what is faster. Layer by
+    /// layer on drivers in software.
     #[default]
     Auto,
     /// A layer is a launch.
