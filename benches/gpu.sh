@@ -3,7 +3,7 @@
 # through wgpu and Vulkan, against PyTorch on the same GPU (where RAYGRAD_PYTHON has one with CUDA) and against what the device
 # does at best; then narrow networks layer by layer against in workgroups. Writes benches/results/<device>.md.
 #
-# usage: benches/gpu.sh [PEERS] [--rounds N] [--scale S] [--devices wgpu,vulkan]
+# usage: benches/gpu.sh [PEERS] [--rounds N] [--steps N] [--scale S] [--devices wgpu,vulkan]
 #        PEERS: folder of the peers' scripts, by default benches/peers; S: a share of the papers' sizes, for slow devices
 source "$(dirname "$0")/common.sh"
 peers=${RAYGRAD_PEERS:-$root/benches/peers} out=$root/benches/results

@@ -27,6 +27,9 @@ struct Args {
     /// What `raygrad --precision` takes.
     #[arg(long, default_value = "f32,mixed", value_delimiter = ',')]
     precisions: Vec<String>,
+    /// Steps of a measurement, by default as many as take about five seconds.
+    #[arg(long)]
+    steps: Option<usize>,
     /// A share of the papers' sizes, where the device is slow or small.
     #[arg(long, default_value_t = 1.0)]
     scale: f64,
@@ -102,7 +105,7 @@ struct Launch {
 fn main() -> anyhow::Result<()> {
     let mut args = Args::parse();
     if quick() {
-        (args.rounds, args.devices) = (1, vec!["vulkan".into()]);
+        (args.rounds, args.devices, args.steps) = (1, vec!["vulkan".into()], Some(1));
     }
     let has_gpu = args.programs.has("PyTorch", "import torch; assert torch.cuda.is_available()");
     let peers = if has_gpu { &PEERS[..] } else { &[] };
@@ -132,7 +135,9 @@ fn main() -> anyhow::Result<()> {
     args.narrow(&mut text)?;
     let words: Vec<&str> = device.split(|c: char| !c.is_ascii_alphanumeric()).filter(|w| !w.is_empty()).collect();
     let file = args.out.join(format!("{}.md", words.join("-")));
-    let head = format!("# {device}\n\n`benches/gpu.sh --rounds {} --scale {}`, medians.\n", args.rounds, args.scale);
+    let steps = args.steps.map_or(String::new(), |n| format!(" --steps {n}"));
+    let head =
+        format!("# {device}\n\n`benches/gpu.sh --rounds {} --scale {}{steps}`, medians.\n", args.rounds, args.scale);
     std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
     std::fs::write(&file, head + &text).with_context(|| format!("cannot write {}", file.display()))?;
     print!("{text}");
@@ -151,12 +156,15 @@ impl Args {
         let mut command = self.programs.bench(preset);
         command.args(["--launches", "--device", device, "--precision", precision]).args(options);
         if quick() {
-            command.args(["--steps", "1", "--set", "field.layers=[16,16]"]);
+            command.args(["--set", "field.layers=[16,16]"]);
             command.args(["--set", "warp.layers=[16,16]", "--set", "warp.skip=[]"]);
             if !preset.starts_with("planar") {
                 command.args(["--set", "scene.image_size=[16,16]", "--set", "scene.train_views=4"]);
                 command.args(["--set", "radiance.skip=[]", "--set", "train.samples=8"]);
             }
+        }
+        if let Some(steps) = self.steps {
+            command.args(["--steps", &steps.to_string()]);
         }
         match output(command) {
             Err(e) if format!("{e:#}").contains("no half precision") => Ok(None),

@@ -2,7 +2,7 @@
 #![cfg(feature = "gpu")]
 
 use raygrad_compiler::autodiff::grad;
-use raygrad_compiler::graph::{Axis, Shape, Tensor};
+use raygrad_compiler::graph::{Axes, Axis, Shape, Tensor};
 use raygrad_compiler::ops::pick::concat;
 use raygrad_compiler::ops::registry;
 use raygrad_compiler::plan::{BufferKind, Program};
@@ -112,6 +112,41 @@ fn work_is_cut_for_the_processors_of_a_device() {
         let (few, many) = (count(4, name), count(4096, name));
         assert!(0 < few && few < many, "{name}: {few}, {many}");
     }
+}
+
+/// Tiles of 128 x 256 for a weight gradient with 319 inputs and 256 outputs: three, with the inputs along m, where the other way
+/// round there would be four; and in chunks that give each processor one.
+#[test]
+fn weight_gradients_are_turned_where_tiles_fit_better() {
+    let row = Axis::new("row", 128_000);
+    let [x, d] = [("x", 319), ("d", 256)].map(|(n, channels)| Tensor::data(n, Shape::new(&[&row], channels)));
+    let step = Step { outputs: vec![("product".into(), x.outer(&d, &Axes::none()))], updates: vec![] };
+    let program = compile(&step, &Target::gpu()).unwrap_or_else(|e| panic!("{e}"));
+    let half = Some(halves()[1]);
+    let limits = Limits { half, max_workgroup_bytes: 48 << 10, workgroups: 132, ..Limits::default() };
+    let kernels = lowered(&program, &limits, "outer");
+    let found: Vec<u32> = kernels.iter().map(|k| k.workgroups.iter().product()).collect();
+    assert_eq!(found[0], 3 * 44, "{:?}", kernels.iter().map(|k| &k.name).collect::<Vec<_>>());
+}
+
+/// A layer of few terms is computed where a wide one is that it is added to, unless it is needed for itself.
+#[test]
+fn little_layers_are_computed_beside_wide_ones() {
+    let row = Axis::new("row", 1000);
+    let count = |terms: usize, needed: bool| {
+        let weight = |name: &str, rows: usize| Tensor::parameter(name, Shape::new(&[], (rows, 64)));
+        let data = |name: &str, channels: usize| Tensor::data(name, Shape::new(&[&row], channels));
+        let little = data("few", terms).linear(&weight("v", terms));
+        let y = (data("many", 40).linear(&weight("w", 40)) + &little).relu();
+        let mut outputs = vec![("y".to_string(), y)];
+        outputs.extend(needed.then(|| ("little".into(), little)));
+        let program = compile(&Step { outputs, updates: vec![] }, &Target::gpu()).unwrap_or_else(|e| panic!("{e}"));
+        lowered(&program, &Limits::default(), "layers").len()
+    };
+    assert_eq!(
+        [(1, false), (4, false), (5, false), (1, true)].map(|(terms, needed)| count(terms, needed)),
+        [1, 1, 2, 2]
+    );
 }
 
 /// What lies between launches is stored as halves where a product reads it, and nothing else is.

@@ -81,6 +81,26 @@ fn a_layer_and_a_layer_that_does_not_vary_along_the_rows() {
 }
 
 #[test]
+fn a_layer_of_few_terms_beside_another() {
+    let (frame, ray) = (Axis::new("frame", 3), Axis::new("ray", 77));
+    let mut inputs = Inputs::new("few terms");
+    let wide = inputs.parameter("wide", Shape::new(&[&frame, &ray], 20));
+    let w = inputs.parameter("w", Shape::new(&[], (20, 70)));
+    for terms in 1..=4 {
+        // One that varies along the rows, from transposed weights too, and one that does not.
+        let few = inputs.parameter(&format!("few {terms}"), Shape::new(&[&frame, &ray], terms));
+        let code = inputs.parameter(&format!("code {terms}"), Shape::new(&[&frame], terms));
+        let v = inputs.parameter(&format!("v {terms}"), Shape::new(&[], (terms, 70)));
+        let u = inputs.parameter(&format!("u {terms}"), Shape::new(&[], (70, terms)));
+        let (y, mask) = (wide.linear(&w), wide.ch(0).greater_than(&Tensor::scalar(0.0)));
+        let sums = (&y + few.linear(&v)).sin();
+        inputs.check(&[&sums, &sums.sum(&[&frame, &ray])], &[]);
+        inputs.check(&[&mask.select(&(&y - few.linear_transposed(&u)), &y).relu()], &[]);
+        inputs.check(&[&(code.broadcast_to(wide.axes()).linear(&v) + &y), &few.linear(&v)], &[]);
+    }
+}
+
+#[test]
 fn a_gather_along_an_axis_that_others_vary_along() {
     let (frame, ray, slot) = (Axis::new("frame", 4), Axis::new("ray", 40), Axis::new("slot", 3));
     let mut inputs = Inputs::new("gather");
