@@ -149,7 +149,13 @@ impl Args {
     /// `None` where the device lacks the precision.
     fn own(&self, work: &Work, device: &str, precision: &str) -> anyhow::Result<Option<Bench>> {
         let rows = if quick() { 64.0 } else { (work.rows * self.scale).round() };
-        self.bench(work.preset, device, precision, &["--set", &format!("{}={rows}", work.setting)])
+        let rows = format!("{}={rows}", work.setting);
+        let mut options = vec!["--set", &rows];
+        if !work.preset.starts_with("planar") {
+            // A step takes as long for small pictures, and its scene is made sooner.
+            options.extend(["--set", "scene.image_size=[64,64]"]);
+        }
+        self.bench(work.preset, device, precision, &options)
     }
 
     fn bench(&self, preset: &str, device: &str, precision: &str, options: &[&str]) -> anyhow::Result<Option<Bench>> {

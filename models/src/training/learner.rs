@@ -7,13 +7,44 @@ use crate::data::initial_values;
 use crate::run::checkpoint::{Checkpoint, Saved};
 use raygrad_compiler::functions::mlp::Parameter;
 use raygrad_compiler::ops::input::Role;
-use raygrad_compiler::{Channels, Program, Shape, Step, compile};
+use raygrad_compiler::{Channels, Program, Shape, Step, Target, compile, cost};
 use raygrad_runtime::{Device, InputInfo, ProgramId, Session};
 use std::collections::BTreeMap;
 
 /// How many times as fast networks layer by layer should be, as predicted, before they are chosen untried: on an H100 resident
 /// ones were the faster ones in all that was measured, also where they were predicted to take 1.04 times as long.
 const CLEARLY: f64 = 1.1;
+
+/// A step's program with its networks in the form asked for. Where both are allowed and differ, `choose` is given layers of their
+/// own and resident networks.
+pub fn compiled(
+    step: &Step,
+    target: &Target,
+    networks: Networks,
+    choose: impl FnOnce([Program; 2]) -> Result<Program, Error>,
+) -> Result<Program, Error> {
+    let resident = || compile(step, &target.with_resident(step));
+    if networks == Networks::Resident {
+        return Ok(resident()?);
+    }
+    let layered = compile(step, target)?;
+    if networks == Networks::Layered || *target == target.with_resident(step) {
+        return Ok(layered);
+    }
+    let resident = resident()?;
+    // Where no network is narrow there is no choice.
+    if resident.to_string() == layered.to_string() { Ok(layered) } else { choose([layered, resident]) }
+}
+
+/// Of layers of their own and resident networks what should be faster, given the seconds that each launch should take.
+pub fn untried([layered, resident]: [Program; 2], seconds: impl Fn(&Program) -> Vec<f64>) -> Program {
+    // A driver in software takes minutes to compile kernels of so many barriers.
+    if layered.target.rates == cost::Rates::SOFTWARE.single() {
+        return layered;
+    }
+    let [apart, together] = [&layered, &resident].map(|program| seconds(program).iter().sum::<f64>());
+    if together < CLEARLY * apart { resident } else { layered }
+}
 
 /// Programs that share parameters, and how far training has got.
 pub struct Learner {
@@ -53,29 +84,10 @@ impl Learner {
     }
 
     fn compile(&self, step: &Step) -> Result<Program, Error> {
-        let target = self.device.target();
-        let resident = || compile(step, &target.with_resident(step));
-        if self.networks == Networks::Resident {
-            return Ok(resident()?);
-        }
-        let layered = compile(step, &target)?;
-        if self.networks == Networks::Layered || target == target.with_resident(step) {
-            return Ok(layered);
-        }
-        let resident = resident()?;
-        // Where no network is narrow there is no choice.
-        if resident.to_string() == layered.to_string() {
-            return Ok(layered);
-        }
-        if self.autotune {
-            return Ok(self.device.faster([layered, resident])?);
-        }
-        // A driver in software takes minutes to compile kernels of so many barriers.
-        if target.rates == raygrad_compiler::cost::Rates::SOFTWARE.single() {
-            return Ok(layered);
-        }
-        let seconds = |program: &Program| self.device.predicted(program).iter().sum::<f64>();
-        Ok(if seconds(&resident) < CLEARLY * seconds(&layered) { resident } else { layered })
+        compiled(step, &self.device.target(), self.networks, |both| match self.autotune {
+            true => Ok(self.device.faster(both)?),
+            false => Ok(untried(both, |program| self.device.predicted(program))),
+        })
     }
 
     pub fn steps_done(&self) -> usize {

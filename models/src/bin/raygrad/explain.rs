@@ -3,15 +3,15 @@
 use crate::{Choice, output_folder, print};
 use clap::{Args, ValueEnum};
 use raygrad::Experiment;
-use raygrad::config::Networks;
 use raygrad::planar::{PlanarData, PlanarModel};
 use raygrad::radiance::data::SpaceDataError;
 use raygrad::radiance::{RadianceModel, SpaceData};
 use raygrad::run::files::write_atomically;
+use raygrad::training::learner::{compiled, untried};
 use raygrad::warps;
 use raygrad_compiler::fuse::TargetKind;
 use raygrad_compiler::graph::topological;
-use raygrad_compiler::{Program, Step, Target, compile};
+use raygrad_compiler::{Program, Step, Target};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
@@ -56,12 +56,10 @@ pub fn run(args: &ExplainArgs) -> anyhow::Result<ExitCode> {
     let experiment = args.choice.experiment()?;
     experiment.layered.validate().map_err(raygrad::Error::from)?;
     let gpu = args.target == TargetChoice::Gpu || matches!(args.emit, Some(Artefact::Wgsl | Artefact::Spirv));
-    let mut target = if gpu { Target::gpu() } else { Target::cpu() };
+    let target = if gpu { Target::gpu() } else { Target::cpu() };
     let (step, recorded) = record(&experiment, target.kind)?;
-    if experiment.layered.settings.run.networks == Networks::Resident {
-        target = target.with_resident(&step);
-    }
-    let program = compile(&step, &target).map_err(raygrad::Error::from)?;
+    let networks = experiment.layered.settings.run.networks;
+    let program = compiled(&step, &target, networks, |both| Ok(untried(both, |p| p.predicted(|_| 4))))?;
     let files = match args.emit {
         None => vec![("explain.txt".to_string(), program.to_string().into_bytes())],
         Some(Artefact::Graph) => vec![("graph.txt".to_string(), graph(&step).into_bytes())],
