@@ -161,6 +161,11 @@ fn sums_of_many_channels_that_are_written_too() {
     // One that replaces what the sums' other operands are made of.
     let replaced = &q * 0.5;
     inputs.check(&[&whole, &(&replaced * &q).channel_groups(every(64))], &[(&q, &replaced)]);
+    // And element by element, where the sums' other operand is what an element of the state was before.
+    let frame = Axis::new("frame", 30);
+    let state = inputs.parameter("state", Shape::new(&[&frame], 700));
+    let next = (&state * 0.5).sin();
+    inputs.check(&[&(&next * &state).sum_channels()], &[(&state, &next)]);
 }
 
 #[test]
