@@ -1,6 +1,7 @@
 //! Small steps that fusion or lowering once got wrong, each on every device against the reference.
 
 use raygrad_compiler::Step;
+use raygrad_compiler::functions::matrix::matmul;
 use raygrad_compiler::graph::{Axes, Axis, Shape, Tensor};
 use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::ops::pick::concat;
@@ -161,11 +162,16 @@ fn sums_of_many_channels_that_are_written_too() {
     // One that replaces what the sums' other operands are made of.
     let replaced = &q * 0.5;
     inputs.check(&[&whole, &(&replaced * &q).channel_groups(every(64))], &[(&q, &replaced)]);
-    // And element by element, where the sums' other operand is what an element of the state was before.
+}
+
+/// Long products of small matrices, in stages; the last is multiplied by the state that it replaces.
+#[test]
+fn a_state_that_a_later_stage_reads() {
     let frame = Axis::new("frame", 30);
-    let state = inputs.parameter("state", Shape::new(&[&frame], 700));
-    let next = (&state * 0.5).sin();
-    inputs.check(&[&(&next * &state).sum_channels()], &[(&state, &next)]);
+    let mut inputs = Inputs::new("stages");
+    let state = inputs.parameter("state", Shape::new(&[&frame], (4, 4)));
+    let next = (0..20).fold(state.clone(), |product, _| matmul(&product, &(&state * 0.5)));
+    inputs.check(&[&matmul(&next, &state)], &[(&state, &next)]);
 }
 
 #[test]

@@ -42,9 +42,9 @@ pub(super) fn kernels(
     let (rows, kept) = (over.elements(), keep.elements());
     let side = |buffer: BufferId, channels: usize| Side { buffer, channels: 0..channels };
     let (inputs, outputs) = (region.inst(*x).channels, region.inst(*d).channels);
-    // Four neighbouring m are one vector, and so should neighbouring outputs be; but narrow tiles are narrow along n.
     let products = kept * rows.div_ceil(CHUNK_ROWS).min(MAX_CHUNKS);
-    // Nor should tiles be padded much.
+    // Four neighbouring m are one vector, and so should neighbouring outputs be; but narrow tiles are narrow along n, and none
+    // should be padded much.
     let time = |m, n| Tile::timed(&limits, (m, n, rows), products).1;
     let swapped = outputs > 32 && (inputs <= 32 || time(outputs, inputs) < 1.2 * time(inputs, outputs));
     let (x, d) = (side(*x_buffer, inputs), side(*d_buffer, outputs));

@@ -322,10 +322,8 @@ impl Split<'_, '_> {
         if let RegionOp::Load(buffer) = self.region.inst(value).op {
             return Ok(buffer);
         }
-        let reads = self.region.reads();
-        let written = self.region.stores.iter().find(|s| s.values()[0] == value && !reads.contains(&s.buffer()));
-        if let Some(store) = written {
-            return Ok(store.buffer());
+        if let Some(buffer) = written_by(&self.region, value) {
+            return Ok(buffer);
         }
         let inst = self.region.inst(value);
         let shape = Shape::of(self.region.domain.clone(), inst.channels, inst.dtype);
@@ -387,6 +385,13 @@ impl Split<'_, '_> {
         }
         Ok(())
     }
+}
+
+/// Where a value is written and a later kernel may read it: to a buffer that the region itself does not read.
+pub(super) fn written_by(region: &Region, value: InstId) -> Option<BufferId> {
+    let reads = region.reads();
+    let written = region.stores.iter().find(|s| s.values()[0] == value && !reads.contains(&s.buffer()));
+    written.map(Store::buffer)
 }
 
 /// Which layer's kernel computes a value: a layer's epilogue is every pointwise value of the same channels after it.
@@ -458,10 +463,10 @@ fn is_layer(region: &Region, id: InstId) -> bool {
 fn is_little(region: &Region, id: InstId) -> bool {
     let terms = |id: InstId| region.inst(region.inst(id).inputs[0]).channels;
     let beside = |other: &InstId| *other != id && is_layer(region, *other) && terms(*other) > LITTLE;
-    let users = || region.body.iter().filter(|user| user.inputs.contains(&id));
+    let mut users = region.body.iter().filter(|user| user.inputs.contains(&id));
     terms(id) <= LITTLE
         && !region.stores.iter().any(|s| s.values().contains(&id))
-        && users().all(|user| matches!(user.op, RegionOp::Map(_)) && user.inputs.iter().any(beside))
+        && users.all(|user| matches!(user.op, RegionOp::Map(_)) && user.inputs.iter().any(beside))
 }
 
 /// Redirects writes that replace a buffer which a later part, or another invocation of the same part, still reads.

@@ -171,30 +171,35 @@ struct Reducer<'r> {
 }
 
 impl Reducer<'_> {
-    /// A total a target; with `fours`, of every fourth row each.
-    fn start(&self, e: &mut Emit, fours: bool) -> Vec<Var> {
+    /// A total a target; in fours, of every fourth row each.
+    fn start(&self, e: &mut Emit) -> Vec<Var> {
         let mut all = vec![];
         for t in self.targets {
             let first = neutral(&mut e.b, t.kind);
-            let first = if fours { e.b.splat(first) } else { first };
+            let first = if self.fours { e.b.splat(first) } else { first };
             all.push(e.b.var("total", first));
         }
         all
     }
 
-    /// Adds the values at one row, or with `fours` at four.
-    fn step(&self, e: &mut Emit, fours: bool, totals: &[Var], (kept, channel, row): (Value, Value, Value)) {
+    /// Adds the values at one row, or in fours at four.
+    fn step(&self, e: &mut Emit, totals: &[Var], (kept, channel, row): (Value, Value, Value)) {
         let position = |row| Position::new(&self.keep, kept).and(&self.over, row);
-        let mut values = Values::from(e, self.region, (&self.over, row, fours), position);
+        let mut values = Values::from(e, self.region, (&self.over, row, self.fours), position);
         for (t, total) in self.targets.iter().zip(totals) {
             let id = self.region.stores[t.store].values()[0];
             let c = if self.by_lane { Channel::Var(channel) } else { Channel::At(t.channel) };
             let next = values.channel(e, id, c);
             let so_far = e.b.get(*total);
             let next = combine(&mut e.b, t.kind, so_far, next);
-            let next = if fours { e.b.splat(next) } else { next };
+            let next = if self.fours { e.b.splat(next) } else { next };
             e.b.set(*total, next);
         }
+    }
+
+    /// Rows that an invocation takes at a time.
+    fn each(&self) -> u32 {
+        if self.fours { 4 } else { 1 }
     }
 
     /// What an invocation found for a target.
@@ -224,10 +229,10 @@ impl Reducer<'_> {
         let mut e = e.with_vectors(self.fours);
         let per_channel = e.b.u(kept_elements);
         let (channel, kept) = (e.b.div(number, per_channel), e.b.rem(number, per_channel));
-        let totals = self.start(&mut e, self.fours);
+        let totals = self.start(&mut e);
         let (from, to) = (e.b.u(0), e.b.u(self.over.elements() as u32));
-        let row = e.b.open_loop("row", from, to, if self.fours { 4 } else { 1 });
-        self.step(&mut e, self.fours, &totals, (kept, channel, row));
+        let row = e.b.open_loop("row", from, to, self.each());
+        self.step(&mut e, &totals, (kept, channel, row));
         e.b.close_loop();
         for (t, total) in self.targets.iter().zip(&totals) {
             let value = self.total(&mut e, t, *total);
@@ -249,26 +254,24 @@ impl Reducer<'_> {
     ) -> Result<Kernel, LowerError> {
         let (kept_elements, rows) = (self.keep.elements(), self.over.elements());
         let results = kept_elements * self.channels;
-        let fours = self.fours;
-        let mut e = Emit::new(layout, limits, (chunks * results) as u64, WORKGROUP)?.with_vectors(fours);
+        let mut e = Emit::new(layout, limits, (chunks * results) as u64, WORKGROUP)?.with_vectors(self.fours);
         if e.spare_workgroups() {
             e.leave_from(e.workgroup, (chunks * results) as u32);
         }
         let (results_value, per_channel) = (e.b.u(results as u32), e.b.u(kept_elements as u32));
         let (chunk, result) = (e.b.div(e.workgroup, results_value), e.b.rem(e.workgroup, results_value));
         let (channel, kept) = (e.b.div(result, per_channel), e.b.rem(result, per_channel));
-        let totals = self.start(&mut e, fours);
+        let totals = self.start(&mut e);
         let length = e.b.u(per_chunk as u32);
         let first = e.b.mul(chunk, length);
         let end = e.b.add(first, length);
         let all = e.b.u(rows as u32);
         let end = if rows.is_multiple_of(per_chunk) { end } else { e.b.math(naga::MathFunction::Min, &[end, all]) };
-        let each = if fours { 4 } else { 1 };
-        let each_value = e.b.u(each);
+        let each_value = e.b.u(self.each());
         let own = e.b.mul(e.invocation, each_value);
         let own = e.b.add(first, own);
-        let row = e.b.open_loop("row", own, end, each * WORKGROUP);
-        self.step(&mut e, fours, &totals, (kept, channel, row));
+        let row = e.b.open_loop("row", own, end, self.each() * WORKGROUP);
+        self.step(&mut e, &totals, (kept, channel, row));
         e.b.close_loop();
 
         let count = self.targets.len() as u32;

@@ -8,7 +8,7 @@
 use super::LowerError;
 use super::elements::{self, closure, own_cost};
 use super::layout::Layout;
-use super::parts::replace_by_load;
+use super::parts::{replace_by_load, written_by};
 use raygrad_compiler::graph::Shape;
 use raygrad_compiler::plan::region::{BufferId, InstId, Region, RegionOp, Store};
 
@@ -77,15 +77,12 @@ pub(super) fn stages(layout: &mut Layout, region: Region) -> Result<Vec<Region>,
     Ok(all)
 }
 
-/// Where a value is written and may be read by a later stage.
-fn written_by(region: &Region, value: InstId) -> Option<BufferId> {
-    let written = region.stores.iter().find(|s| s.values()[0] == value)?;
-    (!region.reads().contains(&written.buffer())).then(|| written.buffer())
-}
-
 /// Written values of few elements and more channels than are unrolled, of which a value with other channels is made: an
 /// invocation that computed both would go through all channels one by one.
 fn own_stages(region: &Region) -> Vec<InstId> {
+    if region.domain.elements() >= elements::MANY {
+        return vec![];
+    }
     let of = |store: &Store| store.values()[0];
     let channels = |store: &Store| region.inst(of(store)).channels;
     let needed = |value: InstId, by: &Store| closure(region, by.values())[value.0 as usize];
@@ -94,8 +91,7 @@ fn own_stages(region: &Region) -> Vec<InstId> {
             && written_by(region, of(s)).is_some()
             && region.stores.iter().any(|by| channels(by) != channels(s) && needed(of(s), by))
     };
-    let few = region.domain.elements() < elements::MANY;
-    region.stores.iter().filter(|_| few).filter(staged).map(of).collect()
+    region.stores.iter().filter(staged).map(of).collect()
 }
 
 /// Eigen-decompositions that a scan's region needs and that need no scan themselves: as a stage before it, and the rest.
