@@ -1,12 +1,12 @@
 //! Registration over seeds: how often, and how well, each method finds the patches of the built-in photo.
 //!
-//! All methods of a seed see the same perturbation, initial neural image and pixel draws. A run succeeds if its mean corner
-//! error is at most 5 pixels at 360 x 480, scaled with the longer side of the photo.
+//! All methods of a seed see the same perturbation, initial neural image and pixel draws. A run succeeds as in
+//! [`raygrad::evaluation::success_px`].
 
 use anyhow::{Context, ensure};
 use clap::Parser;
 use raygrad::Experiment;
-use raygrad::evaluation::Cell;
+use raygrad::evaluation::{Cell, success_px};
 use raygrad_benches::{Table, mean, median, quick, train};
 
 #[derive(Parser)]
@@ -26,10 +26,6 @@ struct Args {
     #[arg(long = "set", value_name = "KEY=VALUE")]
     set: Vec<String>,
 }
-
-/// Allowed mean corner error, in pixels of an image whose longer side is [`REFERENCE_SIDE`].
-const ALLOWED: f64 = 5.0;
-const REFERENCE_SIDE: f64 = 480.0;
 
 struct Run {
     corner: f64,
@@ -63,10 +59,10 @@ fn main() -> anyhow::Result<()> {
             let data = &trainer.data;
             let same = perturbation.get_or_insert_with(|| data.perturbation.clone()) == &data.perturbation;
             ensure!(same, "the perturbation of seed {seed} depends on the method");
-            let allowed = ALLOWED * data.grid.height.max(data.grid.width) as f64 / REFERENCE_SIDE;
+            let allowed = success_px(data.grid.height, data.grid.width);
             let errors = found.corners().context("not a planar preset")?;
             let (corner, psnr) = (errors.mean, found.psnr_db());
-            let run = Run { corner, psnr, seconds, success: corner <= allowed };
+            let run = Run { corner, psnr, seconds, success: corner < allowed };
             let per_patch: Vec<String> = errors.per_patch.iter().map(|e| format!("{e:.2}")).collect();
             eprintln!(
                 "\r{preset} seed {seed}: {corner:.3} px ({}), {psnr:.2} dB, {seconds:.0} s",

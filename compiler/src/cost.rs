@@ -43,7 +43,7 @@ impl Rates {
 
     /// The nearest of 1, 1.5, 2, 3, 4, 6 and so on, at least 1: what is measured twice should be the same.
     pub fn rounded(measured: f64) -> u32 {
-        let halves = (2.0 * measured.max(1.0).log2()).round().min(62.0) as u32;
+        let halves = (2.0 * measured.max(1.0).log2()).round().min(61.0) as u32;
         (if halves.is_multiple_of(2) { 2 } else { 3 }) << (halves / 2) >> 1
     }
 }

@@ -1,8 +1,9 @@
 //! What a compiled program computes: named outputs, and new values of inputs that carry over to the next step.
 
-use crate::graph::{RecordError, Shape, Tensor};
+use crate::graph::{Axes, RecordError, Shape, Tensor};
 use crate::ops::input::{Input, Role};
 use std::collections::HashMap;
+use std::panic::Location;
 
 /// One step: outputs to read back, and updates applied when the step ends.
 #[derive(Clone, Debug, Default)]
@@ -17,18 +18,28 @@ pub struct Step {
 pub enum StepError {
     #[error("{0}")]
     Record(Box<RecordError>),
-    #[error("input `{name}` is recorded as {first} and as {second}; one name is one buffer")]
-    Conflict { name: String, first: Box<Shape>, second: Box<Shape> },
-    #[error("an update must go to a parameter or state input, found {0}")]
-    NotAnInput(String),
-    #[error("the new value of `{name}` is {found}, expected {expected}")]
-    UpdateShape { name: String, expected: Box<Shape>, found: Box<Shape> },
-    #[error("two updates of `{0}`")]
-    TwoUpdates(String),
+    #[error(
+        "input `{name}` is recorded as {first} at {} and as {second} at {}; one name is one buffer",
+        line(.at[0]), line(.at[1])
+    )]
+    Conflict { name: String, first: String, second: String, at: [&'static Location<'static>; 2] },
+    #[error("an update must go to a parameter or state input, found `{op}` of {}", line(.at))]
+    NotAnInput { op: String, at: &'static Location<'static> },
+    #[error("the new value of `{name}`, from {}, is {found}, expected {expected}", line(.at))]
+    UpdateShape { name: String, expected: Box<Shape>, found: Box<Shape>, at: &'static Location<'static> },
+    #[error("two updates of `{name}`, the second from {}", line(.at))]
+    TwoUpdates { name: String, at: &'static Location<'static> },
+    #[error("`{op}` of {} goes over {domain}; a GPU counts to {} elements", line(.at), u32::MAX)]
+    TooManyElements { op: String, domain: Axes, at: &'static Location<'static> },
     #[error("two outputs are called `{0}`")]
     TwoOutputs(String),
     #[error("the step has neither outputs nor updates")]
     Empty,
+}
+
+/// File and line.
+fn line(at: &Location) -> String {
+    format!("{}:{}", at.file(), at.line())
 }
 
 impl Step {
@@ -47,32 +58,32 @@ impl Step {
         if let Some(e) = roots.iter().chain(targets.clone()).find_map(Tensor::error) {
             return Err(StepError::Record(Box::new(e.clone())));
         }
-        let mut names: HashMap<&str, &Input> = HashMap::new();
+        let mut names: HashMap<&str, (&Input, &'static Location)> = HashMap::new();
         let all = crate::graph::topological(self.roots().into_iter().chain(targets.cloned()));
-        for input in all.iter().filter_map(|t| t.op_as::<Input>()) {
+        for (input, at) in all.iter().filter_map(|t| Some((t.op_as::<Input>()?, t.source()))) {
             match names.get(&*input.name) {
-                Some(first) if first.shape != input.shape => {
-                    let (first, second) = (Box::new(first.shape.clone()), Box::new(input.shape.clone()));
-                    return Err(StepError::Conflict { name: input.name.clone(), first, second });
+                Some((first, before)) if *first != input => {
+                    let [first, second] = [first, input].map(|i| format!("{:?} {}", i.role, i.shape));
+                    return Err(StepError::Conflict { name: input.name.clone(), first, second, at: [before, at] });
                 }
-                _ => names.insert(&input.name, input),
+                _ => names.insert(&input.name, (input, at)),
             };
         }
         let mut updated = std::collections::HashSet::new();
         for (target, value) in &self.updates {
             let Some(input) = target.op_as::<Input>().filter(|i| matches!(i.role, Role::Parameter | Role::State))
             else {
-                return Err(StepError::NotAnInput(format!("{target:?}")));
+                return Err(StepError::NotAnInput { op: target.op().name().into(), at: target.source() });
             };
             if !updated.insert(&input.name) {
-                return Err(StepError::TwoUpdates(input.name.clone()));
+                return Err(StepError::TwoUpdates { name: input.name.clone(), at: value.source() });
             }
             let fits = value.shape().axes.is_subset(&input.shape.axes)
                 && value.width() == input.shape.channels.count()
                 && value.dtype() == input.shape.dtype;
             if !fits {
                 let (expected, found) = (Box::new(input.shape.clone()), Box::new(value.shape().clone()));
-                return Err(StepError::UpdateShape { name: input.name.clone(), expected, found });
+                return Err(StepError::UpdateShape { name: input.name.clone(), expected, found, at: value.source() });
             }
         }
         let mut outputs = std::collections::HashSet::new();

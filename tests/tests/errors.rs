@@ -1,10 +1,13 @@
 //! Messages of ops that do not fit: both operands with axes and channels, the user's line, and a hint.
 
-use raygrad_compiler::autodiff::grad;
+use raygrad_compiler::autodiff::{grad, jvp};
 use raygrad_compiler::functions::matrix::matmul;
-use raygrad_compiler::graph::{Axis, Shape, Tensor};
-use raygrad_compiler::reference::{Array, Bindings, EvalError, evaluate};
-use raygrad_compiler::scalar::DType;
+use raygrad_compiler::graph::{Axes, Axis, Shape, Tensor};
+use raygrad_compiler::ops::custom::custom_adjoint;
+use raygrad_compiler::ops::{Pointwise, map};
+use raygrad_compiler::reference::{Array, Bindings, EvalError, Lane, evaluate};
+use raygrad_compiler::scalar::{DType, Prim, ScalarBuilder, Val};
+use raygrad_compiler::{Step, Target, compile};
 
 fn message(t: &Tensor) -> String {
     t.error().expect("does not fit").to_string()
@@ -122,8 +125,87 @@ fn other_arguments() {
     assert!(message(&x.reshape((2, 3))).contains("4 channels cannot be seen as (2, 3)"));
     assert!(message(&x.sym_eig().0).contains("reshape the channels to (n, n)"));
     assert!(message(&x.linear(&x)).contains("weights are (in, out): (4, out) fits here"));
-    assert!(message(&Tensor::constant(&[])).contains("0 values for 0 channels"));
-    assert!(message(&Tensor::parameter("w", Shape::new(&[], 0))).contains("input `w` is empty"));
+    assert!(message(&Tensor::constant(&[])).contains("constant: [] x 0 is empty"));
+    assert!(message(&Tensor::parameter("w", Shape::new(&[], 0))).contains("input: [] x 0 is empty"));
+    assert!(message(&x.pick_as(&[0, 1, 2], (2, 2))).contains("3 channels arranged as (2, 2)"));
+    assert!(message(&x.pick(&[1 << 32])).contains("channels 0 to 3 exist"));
+    assert!(message(&x.channel_groups(vec![vec![7]])).contains("channels 0 to 3 exist"));
+    assert!(message(&x.channel_groups(vec![])).contains("no groups of channels"));
+    assert!(message(&map(Twice, &[&x, &x])).contains("2 operands for an op of 1"));
+    assert!(message(&jvp(&x.sin(), &[&x], &[])).contains("0 tangents for 1 inputs"));
+}
+
+/// An op of a user's own.
+#[derive(Clone, Debug)]
+struct Twice;
+
+impl Pointwise for Twice {
+    fn name(&self) -> &'static str {
+        "twice"
+    }
+    fn operands(&self) -> &'static [Option<DType>] {
+        &[Some(DType::F32)]
+    }
+    fn eval(&self, args: &[Lane]) -> Lane {
+        Lane::F(2.0 * args[0].f())
+    }
+    fn vjp(&self, _: &[Tensor], _: &Tensor, grad: &Tensor) -> Vec<Option<Tensor>> {
+        vec![Some(grad * 2.0)]
+    }
+    fn lower(&self, b: &mut ScalarBuilder, args: &[Val]) -> Val {
+        b.emit(Prim::Add, &[args[0], args[0]])
+    }
+}
+
+#[test]
+fn sizes_that_cannot_be() {
+    let none = Axis::new("none", 0);
+    assert!(message(&Tensor::index(&none)).contains("index: [none=0] x 1 u32 is empty"));
+    let x = Tensor::data("x", Shape::new(&[], 1));
+    assert!(message(&x.broadcast_to(&Axes::new([none]))).contains("[none=0] x 1 is empty"));
+    let huge = ["a", "b", "c"].map(|n| Tensor::index(&Axis::new(n, 1 << 21)).to_f32());
+    let text = message(&(&huge[0] * &huge[1] * &huge[2]));
+    assert!(text.contains("is larger than any memory"), "{text}");
+}
+
+#[test]
+fn gradient_rules_that_leave_out_an_operand() {
+    let (x, y) = (Tensor::parameter("x", Shape::new(&[], 1)), Tensor::parameter("y", Shape::new(&[], 1)));
+    let value = custom_adjoint(&(&x * &y), &[&x, &y], |x, g| vec![Some(g * &x[1])]);
+    let here = at!(1);
+    let text = message(&grad(&value, &[&x])[0]);
+    assert!(text.contains("custom_adjoint: 2 gradients for 3 operands") && text.contains(&here), "{text}");
+}
+
+#[test]
+fn steps_name_the_users_lines() {
+    let axis = Axis::new("row", 70_000);
+    let x = Tensor::parameter("x", Shape::new(&[], 1));
+    let (of_x, data) = (at!(1), Tensor::data("x", Shape::new(&[], 1)));
+    let of_data = at!(1);
+    let twice = &x * 2.0;
+    let of_twice = at!(1);
+    let wide = Tensor::constant(&[1.0, 2.0]);
+    let of_wide = at!(1);
+    let squares = &Tensor::index(&axis).to_f32() * &Tensor::index(&Axis::new("column", 70_000)).to_f32();
+    let of_squares = at!(1);
+    let total = squares.sum_over(squares.axes());
+    let step = |outputs: &[&Tensor], updates: &[(&Tensor, &Tensor)]| Step {
+        outputs: outputs.iter().enumerate().map(|(i, t)| (i.to_string(), (*t).clone())).collect(),
+        updates: updates.iter().map(|(a, b)| ((*a).clone(), (*b).clone())).collect(),
+    };
+    let gpu = Target::gpu();
+    for (step, expected) in [
+        (step(&[&x, &data], &[]), vec!["Parameter [] x 1", "Data [] x 1", &of_x, &of_data]),
+        (step(&[], &[(&twice, &x)]), vec!["found `mul`", &of_twice]),
+        (step(&[], &[(&x, &wide)]), vec!["is [] x 2, expected [] x 1", &of_wide]),
+        (step(&[], &[(&x, &twice), (&x, &twice)]), vec!["two updates of `x`", &of_twice]),
+        (step(&[&total], &[]), vec!["[row=70000, column=70000]", "counts to 4294967295", &of_squares]),
+    ] {
+        let text = compile(&step, &gpu).expect_err("refused").to_string();
+        assert!(expected.iter().all(|e| text.contains(e)), "{text}: {expected:?}");
+    }
+    assert!(compile(&step(&[&total], &[]), &Target::cpu()).is_ok());
 }
 
 #[test]

@@ -33,8 +33,15 @@ pub fn vjp(output: &Tensor, upstream: &Tensor, wanted: &[&Tensor]) -> Vec<Tensor
     }
     for t in order.iter().rev() {
         let Some(g) = adjoint.get(&t.id()).cloned() else { continue };
+        let gradients = with_source(t.source(), || t.op().vjp(t.inputs(), t, &g));
+        if gradients.len() != t.inputs().len() {
+            let problem = format!("{} gradients for {} operands", gradients.len(), t.inputs().len());
+            let refused =
+                || Tensor::misfit(t.op().name(), &[t], problem, "a rule gives one gradient, or None, an operand");
+            return vec![with_source(t.source(), refused); wanted.len()];
+        }
         with_source(t.source(), || {
-            for (input, dx) in t.inputs().iter().zip(t.op().vjp(t.inputs(), t, &g)) {
+            for (input, dx) in t.inputs().iter().zip(gradients) {
                 let Some(dx) = dx else { continue };
                 if !reaches.contains(&input.id()) || input.dtype() == DType::U32 {
                     continue;
@@ -55,6 +62,10 @@ pub fn vjp(output: &Tensor, upstream: &Tensor, wanted: &[&Tensor]) -> Vec<Tensor
 /// mode with respect to its upstream factor.
 #[track_caller]
 pub fn jvp(output: &Tensor, inputs: &[&Tensor], tangents: &[&Tensor]) -> Tensor {
+    if inputs.len() != tangents.len() {
+        let problem = format!("{} tangents for {} inputs", tangents.len(), inputs.len());
+        return Tensor::misfit("jvp", &[output], problem, "give one tangent an input");
+    }
     let upstream = Tensor::input("jvp.upstream", crate::ops::input::Role::Data, output.shape().clone());
     let pulled = vjp(output, &upstream, inputs);
     let paired = pulled.iter().zip(tangents).map(|(g, t)| (g * *t).sum_channels().sum_over(g.axes()));

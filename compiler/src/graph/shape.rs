@@ -1,6 +1,7 @@
 //! What a tensor is: axes, channels and lane type.
 
 use super::axis::{Axes, Axis};
+use super::error::Misfit;
 use crate::scalar::DType;
 use std::fmt;
 
@@ -65,6 +66,20 @@ impl Shape {
     pub fn with_axes(mut self, axes: Axes) -> Shape {
         self.axes = axes;
         self
+    }
+    /// Refuses shapes without lanes, and those whose lanes cannot be counted.
+    pub(super) fn check(&self) -> Result<(), Misfit> {
+        let (rows, columns) = match self.channels {
+            Channels::Vector(n) => (n, 1),
+            Channels::Matrix(r, c) => (r, c),
+        };
+        let sizes = self.axes.iter().map(Axis::size).chain([rows, columns]);
+        // A lane has four bytes.
+        match sizes.fold(Some(4usize), |n, size| n?.checked_mul(size)) {
+            Some(0) => Err(Misfit::new(format!("{self} is empty"), "axes and channels start at 1")),
+            Some(bytes) if bytes <= isize::MAX as usize => Ok(()),
+            _ => Err(Misfit::new(format!("{self} is larger than any memory"), "use smaller axes")),
+        }
     }
     /// Number of 32-bit lanes: elements times channels.
     pub fn lanes(&self) -> usize {

@@ -59,7 +59,8 @@ impl Tensor {
         let source = SOURCE.get().unwrap_or(Location::caller());
         let shapes: Vec<Shape> = inputs.iter().map(|t| t.shape().clone()).collect();
         let poisoned = inputs.iter().find_map(|t| t.0.error.clone());
-        let (shape, error) = match (poisoned, op.shape(&shapes)) {
+        let found = op.shape(&shapes).and_then(|shape| shape.check().map(|()| shape));
+        let (shape, error) = match (poisoned, found) {
             (Some(e), Ok(shape)) => (shape, Some(e)),
             (Some(e), Err(_)) => (Shape::new(&[], 1), Some(e)),
             (None, Ok(shape)) => (shape, name_clash(&op, &inputs, source)),

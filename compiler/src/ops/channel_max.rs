@@ -29,7 +29,8 @@ impl Op for ChannelMax {
     }
     fn vjp(&self, inputs: &[Tensor], output: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
         let hit = inputs[0].equal(output).to_f32();
-        let ties = hit.sum_channels();
+        // At least one, also where rounding makes the maximum differ from its own operand.
+        let ties = hit.sum_channels().max(&Tensor::scalar(1.0));
         vec![Some(hit * (g / ties))]
     }
     fn work(&self, inputs: &[Shape], _: &Shape) -> Work {

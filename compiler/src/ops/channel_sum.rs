@@ -17,6 +17,16 @@ impl Op for ChannelSum {
     }
     fn shape(&self, inputs: &[Shape]) -> Result<Shape, Misfit> {
         expect_dtype(&inputs[0], DType::F32, 0)?;
+        let has = inputs[0].channels;
+        if let Some(c) = self.0.iter().flatten().find(|c| **c as usize >= has.count()) {
+            return Err(Misfit::new(
+                format!("channel {c} of a tensor with {has} channels"),
+                format!("channels 0 to {} exist", has.count() - 1),
+            ));
+        }
+        if self.0.is_empty() {
+            return Err(Misfit::new("no groups of channels", "give at least one group"));
+        }
         Ok(inputs[0].clone().with_channels(Channels::Vector(self.0.len())))
     }
     fn form(&self) -> Form {

@@ -21,11 +21,8 @@ impl Op for Constant {
             Constant::F(v, c) => (v.len(), *c, DType::F32),
             Constant::U(v) => (v.len(), Channels::Vector(v.len()), DType::U32),
         };
-        if len == 0 || len != channels.count() {
-            return Err(Misfit::new(
-                format!("{len} values for {channels} channels"),
-                "give one value a channel, and at least one",
-            ));
+        if len != channels.count() {
+            return Err(Misfit::new(format!("{len} values for {channels} channels"), "give one value a channel"));
         }
         Ok(Shape::of(Axes::none(), channels, dtype))
     }

@@ -40,6 +40,12 @@ impl Op for Pick {
         if self.pick.is_empty() {
             return Err(Misfit::new("no channels left", "take at least one channel"));
         }
+        if self.pick.len() != self.channels.count() {
+            return Err(Misfit::new(
+                format!("{} channels arranged as {}", self.pick.len(), self.channels),
+                "pick as many channels as the result has",
+            ));
+        }
         Ok(Shape::of(axes, self.channels, inputs[0].dtype))
     }
     fn form(&self) -> Form {
@@ -103,7 +109,7 @@ impl Tensor {
     /// Like [`Tensor::pick`], with the result arranged as `shape`.
     #[track_caller]
     pub fn pick_as(&self, channels: &[usize], shape: impl Into<Channels>) -> Tensor {
-        let pick = channels.iter().map(|c| (0, *c as u32)).collect();
+        let pick = channels.iter().map(|c| (0, u32::try_from(*c).unwrap_or(u32::MAX))).collect();
         Tensor::record(Pick { pick, channels: shape.into(), name: "pick" }, &[self])
     }
     /// The transposed small matrix.

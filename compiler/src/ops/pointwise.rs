@@ -50,6 +50,12 @@ impl<P: Pointwise> Op for Map<P> {
 
     fn shape(&self, inputs: &[Shape]) -> Result<Shape, Misfit> {
         let want = self.0.operands();
+        if want.len() != inputs.len() || want.len() > MAX_OPERANDS {
+            return Err(Misfit::new(
+                format!("{} operands for an op of {}", inputs.len(), want.len()),
+                format!("give one tensor an operand; pointwise ops have at most {MAX_OPERANDS}"),
+            ));
+        }
         let mut axes = inputs[0].axes.clone();
         let mut channels = inputs[0].channels;
         let mut free: Option<DType> = None;

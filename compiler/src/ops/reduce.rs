@@ -60,7 +60,8 @@ impl Op for Reduce {
             Reduction::Sum => g.broadcast_to(x.axes()),
             Reduction::Max => {
                 let hit = x.equal(output).to_f32();
-                let ties = hit.sum_over(&self.over);
+                // At least one, also where rounding makes the maximum differ from its own operand.
+                let ties = hit.sum_over(&self.over).max(&Tensor::scalar(1.0));
                 hit * (g / ties)
             }
         };
@@ -87,8 +88,8 @@ impl Tensor {
     /// Mean over the given axes.
     #[track_caller]
     pub fn mean(&self, over: &[&Axis]) -> Tensor {
-        let n: usize = over.iter().map(|a| a.size()).product();
-        self.sum(over) * (1.0 / n as f64)
+        let over = Axes::new(over.iter().map(|a| (*a).clone()));
+        self.sum_over(&over) * (1.0 / over.elements() as f64)
     }
     /// Mean over all axes and channels.
     #[track_caller]

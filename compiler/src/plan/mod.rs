@@ -7,7 +7,7 @@ pub mod explain;
 pub mod region;
 mod spec;
 
-use crate::fuse::{Fused, Origin, Target, fuse};
+use crate::fuse::{Fused, Origin, Target, TargetKind, fuse};
 use crate::graph::{Axes, Shape};
 use crate::ops::input::Role;
 use crate::simplify::simplify;
@@ -73,13 +73,30 @@ pub fn compile(step: &Step, target: &Target) -> Result<Program, StepError> {
     let recorded = count_ops(step);
     let step = simplify(step);
     let simplified = Instant::now();
-    let fused = fuse(&step.roots(), *target);
+    let roots = step.roots();
+    if let Some(e) = roots.iter().find_map(crate::graph::Tensor::error) {
+        return Err(StepError::Record(Box::new(e.clone())));
+    }
+    let fused = fuse(&roots, *target);
+    if target.kind == TargetKind::Gpu {
+        fused.regions.iter().try_for_each(countable)?;
+    }
     let fused_at = Instant::now();
     let mut program = plan(&step, fused, *target);
     program.ops = recorded;
     program.timing = Timing { simplify: simplified - start, fuse: fused_at - simplified, plan: fused_at.elapsed() };
     spec::check(&program);
     Ok(program)
+}
+
+/// Refuses a region with more elements than kernels of GPUs count.
+fn countable(region: &Region) -> Result<(), StepError> {
+    match region.body.last() {
+        Some(last) if u32::try_from(region.domain.elements()).is_err() => {
+            Err(StepError::TooManyElements { op: last.label.clone(), domain: region.domain.clone(), at: last.source })
+        }
+        _ => Ok(()),
+    }
 }
 
 fn count_ops(step: &Step) -> usize {
@@ -250,8 +267,9 @@ fn assign_slots(buffers: &mut [Buffer], launches: &[Launch]) -> Vec<usize> {
             last[b] = last[b].max(at);
         }
     }
-    let mut order: Vec<usize> =
-        (0..buffers.len()).filter(|b| matches!(buffers[*b].kind, BufferKind::Temporary { .. })).collect();
+    // What became an update in place has no launch of its own left, and needs no room.
+    let used = |b: &usize| first[*b] != usize::MAX && matches!(buffers[*b].kind, BufferKind::Temporary { .. });
+    let mut order: Vec<usize> = (0..buffers.len()).filter(used).collect();
     order.sort_by_key(|b| std::cmp::Reverse(buffers[*b].shape.lanes()));
     let mut slots: Vec<(usize, Vec<(usize, usize)>)> = vec![];
     for b in order {

@@ -11,6 +11,7 @@ use crate::graph::{Axes, Tensor, topological, with_source};
 use crate::ops::Form;
 use crate::ops::constant::Constant;
 use crate::step::Step;
+use std::any::{Any, TypeId};
 use std::collections::HashMap;
 use std::sync::Arc;
 
@@ -22,9 +23,10 @@ pub fn simplify(step: &Step) -> Step {
     let mut step = step.clone();
     for _ in 0..MAX_PASSES {
         let mut pass = Pass::default();
+        pass.rebuild(step.roots());
         let next = Step {
-            outputs: step.outputs.iter().map(|(n, t)| (n.clone(), pass.rebuild(t))).collect(),
-            updates: step.updates.iter().map(|(i, t)| (i.clone(), pass.rebuild(t))).collect(),
+            outputs: step.outputs.iter().map(|(n, t)| (n.clone(), pass.rebuilt(t))).collect(),
+            updates: step.updates.iter().map(|(i, t)| (i.clone(), pass.rebuilt(t))).collect(),
         };
         step = next;
         if !pass.changed {
@@ -38,17 +40,15 @@ pub fn simplify(step: &Step) -> Step {
 #[derive(Default)]
 struct Pass {
     done: HashMap<u64, Tensor>,
-    /// Key, operands and axes of every rebuilt node: common subexpressions. Keys name axes, and two axes may share a name.
-    known: HashMap<(String, Vec<u64>, Axes), Tensor>,
+    /// Type, name and key of the op, operands and axes of every rebuilt node: common subexpressions. Keys tell ops of one name
+    /// apart, and two axes may share a name.
+    known: HashMap<(TypeId, &'static str, String, Vec<u64>, Axes), Tensor>,
     changed: bool,
 }
 
 impl Pass {
-    fn rebuild(&mut self, root: &Tensor) -> Tensor {
-        for t in topological([root.clone()]) {
-            if self.done.contains_key(&t.id()) {
-                continue;
-            }
+    fn rebuild(&mut self, roots: Vec<Tensor>) {
+        for t in topological(roots) {
             let rebuilt = t.with_inputs(t.inputs().iter().map(|i| self.done[&i.id()].clone()).collect());
             let simpler = with_source(t.source(), || rules::rewrite(&rebuilt).or_else(|| split::rewrite(&rebuilt)));
             let result = match simpler {
@@ -60,11 +60,15 @@ impl Pass {
             };
             self.done.insert(t.id(), result);
         }
+    }
+
+    fn rebuilt(&self, root: &Tensor) -> Tensor {
         self.done[&root.id()].clone()
     }
 
     fn share(&mut self, t: Tensor) -> Tensor {
-        let key = (t.op().key(), t.inputs().iter().map(Tensor::id).collect(), t.axes().clone());
+        let (op, operands) = (&**t.op(), t.inputs().iter().map(Tensor::id).collect());
+        let key = (Any::type_id(op), op.name(), op.key(), operands, t.axes().clone());
         match self.known.get(&key) {
             Some(known) => {
                 self.changed |= known.id() != t.id();

@@ -83,16 +83,14 @@ fn algebra(t: &Tensor) -> Option<Tensor> {
             (Some(0.0), _) | (_, Some(0.0)) => return Some(like(&Tensor::scalar(0.0), t)),
             _ => {}
         }
-        // Factors of one value collect: (x c) d = x (c d).
+        // Factors of one value collect: (x c) d = x (c d), as long as single precision holds the product.
         let (x, d) = if cb.is_some() { (a, b) } else { (b, a) };
         let d = constant_value(d)?;
         if is_map::<Mul>(x) {
             let (y, c) = (&x.inputs()[0], &x.inputs()[1]);
-            if let Some(c) = constant_value(c) {
-                return Some(like(&(y * (c * d)), t));
-            }
-            if let Some(c) = constant_value(y) {
-                return Some(like(&(&x.inputs()[1] * (c * d)), t));
+            let (y, c) = if constant_value(c).is_some() { (y, c) } else { (c, y) };
+            if let Some(product) = constant_value(c).map(|c| c * d).filter(|p| (*p as f32).is_normal()) {
+                return Some(like(&(y * product), t));
             }
         }
     }

@@ -34,8 +34,8 @@ pub enum ConfigError {
     UnknownKey { origin: Origin, key: String, nearest: Option<String> },
     #[error("{origin}: `{key}`: {message}")]
     Value { origin: Origin, key: String, message: String },
-    #[error("{file}: missing `{key}`; add it, or build on a preset with `base = \"planar-l2g\"`")]
-    Missing { file: String, key: String },
+    #[error("{file}: missing `{key}`; add it, or build on a preset with `base = \"{base}\"`")]
+    Missing { file: String, key: String, base: &'static str },
     #[error("{file}: missing `presets`, the list of what to run")]
     MissingOfSweep { file: String },
     #[error("{origin}: `base` chains back to `{name}`: a file cannot build on itself")]

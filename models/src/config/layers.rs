@@ -1,7 +1,8 @@
 //! Layers of settings: a file, the `base` below it, assignments above it, each value with its origin.
 //!
-//! A file may have a section `captures`: what it sets instead where the scene is a capture ([`crate::scene::Layout::is_capture`]), as in
-//! `optim.lr = 1e-3` below `[captures]`. Whatever is set later, in a file or by an assignment, wins over both.
+//! A file may say what it sets for some scenes only: below `[captures]` where the scene is a capture
+//! ([`crate::scene::Layout::is_capture`]), as in `optim.lr = 1e-3`, and below `[on.NAME]` where it is called so
+//! ([`Settings::scene_name`]). Whatever is set later, in a file or by an assignment, wins.
 
 use super::error::{ConfigError, Origin};
 use super::leaves::{Leaf, leaves};
@@ -17,17 +18,66 @@ pub struct Layered {
     /// Name of the preset, or stem of the file.
     pub name: String,
     pub settings: Settings,
-    table: Table,
-    origins: BTreeMap<String, Origin>,
-    /// The section `captures`; once the scene is a capture, what is set where it is not.
-    other: BTreeMap<String, (Value, Origin)>,
-    on_capture: bool,
+    /// What was set for each key, in order; of those that hold the last one is in force.
+    set: BTreeMap<String, Vec<Setting>>,
+    /// What the conditions are about.
+    scene: Scene,
 }
 
-/// Before the keys of the section.
-const CAPTURES: &str = "captures.";
-/// The key of the scene's folder.
-const SCENE: &str = "scene.path";
+/// One value that was set.
+#[derive(Clone, Debug)]
+struct Setting {
+    when: When,
+    value: Value,
+    origin: Origin,
+}
+
+/// Where a value holds.
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum When {
+    Always,
+    /// The scene is a capture.
+    Capture,
+    /// The scene has this name.
+    On(String),
+}
+
+#[derive(Clone, Debug, Default)]
+struct Scene {
+    name: String,
+    is_capture: bool,
+}
+
+/// The keys on which the scene depends.
+const SCENE: [&str; 2] = ["scene.path", "data.image"];
+
+impl When {
+    /// The condition in front of a key of a file, and the key.
+    fn split(key: &str) -> (When, &str) {
+        if let Some(key) = key.strip_prefix("captures.") {
+            return (When::Capture, key);
+        }
+        match key.strip_prefix("on.").and_then(|rest| rest.split_once('.')) {
+            Some((scene, key)) => (When::On(scene.to_string()), key),
+            None => (When::Always, key),
+        }
+    }
+
+    fn holds(&self, scene: &Scene) -> bool {
+        match self {
+            When::Always => true,
+            When::Capture => scene.is_capture,
+            When::On(name) => *name == scene.name,
+        }
+    }
+}
+
+impl Scene {
+    fn of(settings: &Settings) -> Scene {
+        let is_capture = settings.scene.as_ref().is_some_and(|s| s.layout().is_capture());
+        Scene { name: settings.scene_name(), is_capture }
+    }
+}
 
 impl Layered {
     /// Loads a preset by name, or a file if `name` ends in `.toml`.
@@ -48,26 +98,28 @@ impl Layered {
 
     /// Sets one value, given as it would be written in a file or as a bare word.
     pub fn assign(&mut self, key: &str, raw: &str, origin: Origin) -> Result<(), ConfigError> {
-        self.check_key(key, &origin)?;
         let word = Value::String(raw.to_string());
         let parsed =
             format!("v = {raw}").parse::<Table>().ok().filter(|t| t.len() == 1).and_then(|mut t| t.remove("v"));
         match parsed {
-            None => self.put(key, word, origin),
+            None => self.apply(key, word, origin),
             // A path such as `2024` is a number in TOML, but a word where a word is due.
-            Some(value) => self.put(key, value, origin.clone()).or_else(|e| self.put(key, word, origin).map_err(|_| e)),
+            Some(value) => {
+                self.apply(key, value, origin.clone()).or_else(|e| self.apply(key, word, origin).map_err(|_| e))
+            }
         }
     }
 
     /// Sets a value that is text, such as a path.
     pub fn set_text(&mut self, key: &str, text: &str, origin: Origin) {
         // Text fits a field of text: there is nothing to refuse.
-        let _ = self.put(key, Value::String(text.to_string()), origin);
+        let _ = self.apply(key, Value::String(text.to_string()), origin);
     }
 
-    /// Where a value was set.
+    /// Where the value in force was set.
     pub fn origin(&self, key: &str) -> Origin {
-        self.origins.get(key).cloned().unwrap_or_else(|| Origin::Option(self.name.clone()))
+        let set = self.set.get(key).and_then(|set| self.in_force(set));
+        set.map_or_else(|| Origin::Option(self.name.clone()), |s| s.origin.clone())
     }
 
     /// An error about the value of `key`.
@@ -75,67 +127,66 @@ impl Layered {
         ConfigError::Value { origin: self.origin(key), key: key.to_string(), message: message.into() }
     }
 
-    /// Whether the scene is a capture and something is set for those.
-    pub fn is_on_capture(&self) -> bool {
-        self.on_capture && !self.other.is_empty()
+    /// The settings that hold for this scene, and would not for any other: keys and values.
+    pub fn of_scene(&self) -> Vec<(&str, &Value)> {
+        let mut found = vec![];
+        for (key, set) in &self.set {
+            let Some(s) = self.in_force(set).filter(|s| s.when != When::Always) else { continue };
+            found.push((key.as_str(), &s.value));
+        }
+        found
     }
 
-    /// Sets a value that a file sets.
+    /// Sets one value; a condition in front of the key says where it holds. The old one stays if the new one has the wrong type.
     pub(super) fn apply(&mut self, key: &str, value: Value, origin: Origin) -> Result<(), ConfigError> {
-        self.check_key(key, &origin)?;
-        self.put(key, value, origin)
-    }
-
-    /// Sets a value that a file sets for captures. In force or not, it must fit.
-    fn apply_to_captures(&mut self, key: &str, value: Value, origin: Origin) -> Result<(), ConfigError> {
-        self.check_key(key, &origin)?;
-        let mut other = self.replace(key, value, origin)?;
-        if !self.on_capture {
-            other = self.replace(key, other.0, other.1)?;
+        let (when, key) = When::split(key);
+        if !self.set.contains_key(key) {
+            return Err(unknown(origin, key, self.set.keys()));
         }
-        self.other.insert(key.to_string(), other);
-        Ok(())
-    }
-
-    fn check_key(&self, key: &str, origin: &Origin) -> Result<(), ConfigError> {
-        if self.origins.contains_key(key) {
-            return Ok(());
-        }
-        Err(unknown(origin.clone(), key, self.origins.keys()))
-    }
-
-    /// Sets one value, for captures and all other scenes; the old one stays if it has the wrong type.
-    fn put(&mut self, key: &str, value: Value, origin: Origin) -> Result<(), ConfigError> {
-        self.replace(key, value, origin)?;
-        self.other.remove(key);
-        if key == SCENE { self.suit_scene() } else { Ok(()) }
-    }
-
-    /// Exchanges the values that captures have for themselves where the scene has become one, or ceased to be one.
-    fn suit_scene(&mut self) -> Result<(), ConfigError> {
-        let is_capture = self.settings.scene.as_ref().is_some_and(|s| s.layout().is_capture());
-        if is_capture != self.on_capture {
-            self.on_capture = is_capture;
-            for (key, (value, origin)) in std::mem::take(&mut self.other) {
-                let old = self.replace(&key, value, origin)?;
-                self.other.insert(key, old);
-            }
-        }
-        Ok(())
-    }
-
-    /// Replaces one value and returns the old one, which stays if the new one has the wrong type.
-    fn replace(&mut self, key: &str, value: Value, origin: Origin) -> Result<(Value, Origin), ConfigError> {
-        let mut table = self.table.clone();
-        let old = slot(&mut table, key).map_or(Value::Boolean(false), |slot| std::mem::replace(slot, value));
-        self.settings = parse(&table).map_err(|(field, message)| ConfigError::Value {
+        // In force or not, it must fit.
+        let mut table = self.table();
+        insert(&mut table, key, value.clone());
+        let trial = parse(&table).map_err(|(field, message)| ConfigError::Value {
             origin: origin.clone(),
             key: if field.is_empty() { key.to_string() } else { field },
             message,
         })?;
-        self.table = table;
-        let from = self.origins.insert(key.to_string(), origin.clone()).unwrap_or(origin);
-        Ok((old, from))
+        if SCENE.contains(&key) {
+            if when != When::Always {
+                let message = "what holds for some scenes cannot say which one it is".to_string();
+                return Err(ConfigError::Value { origin, key: key.to_string(), message });
+            }
+            self.scene = Scene::of(&trial);
+        }
+        let set = self.set.entry(key.to_string()).or_default();
+        if when == When::Always {
+            set.clear();
+        }
+        set.push(Setting { when, value, origin });
+        self.settle();
+        Ok(())
+    }
+
+    fn in_force<'a>(&self, set: &'a [Setting]) -> Option<&'a Setting> {
+        set.iter().rev().find(|s| s.when.holds(&self.scene))
+    }
+
+    /// All values in force.
+    fn table(&self) -> Table {
+        let mut table = Table::new();
+        for (key, set) in &self.set {
+            if let Some(s) = self.in_force(set) {
+                insert(&mut table, key, s.value.clone());
+            }
+        }
+        table
+    }
+
+    /// Takes the values in force. Each of them fitted when it was set, and fields do not depend on each other.
+    fn settle(&mut self) {
+        if let Ok(settings) = parse(&self.table()) {
+            self.settings = settings;
+        }
     }
 }
 
@@ -154,8 +205,9 @@ fn load(name: &str, below: &mut Vec<String>) -> Result<Layered, ConfigError> {
             return Err(ConfigError::UnknownPreset { name: name.to_string(), nearest });
         }
     };
-    let (captures, mut leaves): (Vec<Leaf>, Vec<Leaf>) =
-        leaves(&file, &text)?.into_iter().partition(|l| l.key.starts_with(CAPTURES));
+    // What holds for some scenes wins over what the same file sets for all, wherever in the file it stands.
+    let (some, mut leaves): (Vec<Leaf>, Vec<Leaf>) =
+        leaves(&file, &text)?.into_iter().partition(|l| When::split(&l.key).0 != When::Always);
     let base = leaves.iter().position(|l| l.key == "base").map(|i| leaves.remove(i));
     below.push(name.to_string());
     let mut layered = match base {
@@ -175,40 +227,41 @@ fn load(name: &str, below: &mut Vec<String>) -> Result<Layered, ConfigError> {
             Layered { name: label, ..layered }
         }
     };
-    for leaf in captures {
-        layered.apply_to_captures(&leaf.key[CAPTURES.len()..], leaf.value, leaf.origin)?;
+    for leaf in some {
+        layered.apply(&leaf.key, leaf.value, leaf.origin)?;
     }
     Ok(layered)
 }
 
 /// A file without a base: it must set everything.
 fn root(name: String, file: String, leaves: Vec<Leaf>) -> Result<Layered, ConfigError> {
-    let known: Vec<String> = known_keys(leaves.iter().any(|l| l.key.starts_with("scene.")));
-    let (mut table, mut origins) = (Table::new(), BTreeMap::new());
-    for leaf in leaves {
-        if !known.contains(&leaf.key) {
-            return Err(unknown(leaf.origin, &leaf.key, known.iter()));
+    let space = leaves.iter().any(|l| l.key.starts_with("scene."));
+    let known: Vec<String> = known_keys(space);
+    let (mut table, mut set) = (Table::new(), BTreeMap::new());
+    for Leaf { key, value, origin } in leaves {
+        if !known.contains(&key) {
+            return Err(unknown(origin, &key, known.iter()));
         }
-        insert(&mut table, &leaf.key, leaf.value);
-        origins.insert(leaf.key, leaf.origin);
+        insert(&mut table, &key, value.clone());
+        set.insert(key, vec![Setting { when: When::Always, value, origin }]);
     }
-    if let Some(key) = known.iter().find(|k| !origins.contains_key(*k)) {
-        return Err(ConfigError::Missing { file, key: key.clone() });
+    if let Some(key) = known.iter().find(|k| !set.contains_key(*k)) {
+        let base = if space { "l2g-blender" } else { "planar-l2g" };
+        return Err(ConfigError::Missing { file, key: key.clone(), base });
     }
     let settings = parse(&table).map_err(|(key, message)| {
-        let origin = origins.iter().find(|(k, _)| key.starts_with(*k)).map(|(_, o)| o.clone());
+        let origin = set.iter().find(|(k, _)| key.starts_with(*k)).map(|(_, set)| set[0].origin.clone());
         ConfigError::Value { origin: origin.unwrap_or(Origin::Line { file, line: 1 }), key, message }
     })?;
-    let mut layered = Layered { name, settings, table, origins, other: BTreeMap::new(), on_capture: false };
-    layered.suit_scene()?;
-    Ok(layered)
+    Ok(Layered { name, scene: Scene::of(&settings), settings, set })
 }
 
 /// The keys of the preset that sets them all, in 3D or 2D.
 fn known_keys(space: bool) -> Vec<String> {
     let root = |p: &&Preset| !p.text.contains("\nbase ") && p.text.contains("\n[scene]") == space;
     let text = PRESETS.iter().find(root).map_or("", |p| p.text);
-    leaves("", text).unwrap_or_default().into_iter().map(|l| l.key).collect()
+    let all = leaves("", text).unwrap_or_default().into_iter().map(|l| l.key);
+    all.filter(|key| When::split(key).0 == When::Always).collect()
 }
 
 fn insert(table: &mut Table, key: &str, value: Value) {
@@ -222,13 +275,6 @@ fn insert(table: &mut Table, key: &str, value: Value) {
                 insert(inner, rest, value);
             }
         }
-    }
-}
-
-fn slot<'a>(table: &'a mut Table, key: &str) -> Option<&'a mut Value> {
-    match key.split_once('.') {
-        None => table.get_mut(key),
-        Some((section, rest)) => slot(table.get_mut(section)?.as_table_mut()?, rest),
     }
 }
 
@@ -337,6 +383,44 @@ mod tests {
     }
 
     #[test]
+    fn scenes_have_values_of_their_own() {
+        let numbers = |preset: &str, scene: &str, set: &[&str]| {
+            let mut l = Layered::load(preset).unwrap();
+            set.iter().for_each(|s| l.set(s).unwrap());
+            l.set_text("scene.path", scene, Origin::Option("--data".into()));
+            l.validate().unwrap();
+            (l.settings.noise.rotation, l.settings.noise.translation, l.settings.loss.alignment)
+        };
+        // The noise of the L2G-NeRF supplement, Table 2; its weights, Table 3; those of INN's, Tables 1 and 2.
+        assert_eq!(numbers("l2g-blender", "data/chair", &[]), (0.01, 0.4, 1e2));
+        assert_eq!(numbers("barf-blender", "data/ship", &[]), (0.09, 0.7, 1e2));
+        assert_eq!(numbers("l2g-small", "data/lego", &[]), (0.07, 0.5, 1e2));
+        assert_eq!(numbers("l2g-blender", "data/mine", &[]), (0.03, 0.3, 1e2));
+        assert_eq!(numbers("l2g-blender", "data/chair", &["noise.rotation=0.5"]), (0.5, 0.4, 1e2));
+        assert_eq!(numbers("barf-blender-original", "data/chair", &[]).0, 0.15);
+        for (preset, scene, alignment) in [
+            ("l2g-llff", "fern", 1e2),
+            ("l2g-llff", "flower", 1e3),
+            ("l2g-llff", "trex", 1e5),
+            ("l2g-noglobal-llff", "trex", 0.0),
+            ("inn-llff", "fern", 1e4),
+            ("inn-llff", "fortress", 1e5),
+            ("inn-llff", "trex", 1e4),
+            ("multi-inn-llff", "room", 1e3),
+            ("inn-dtu", "dtu_scan24", 1e4),
+            ("inn-dtu", "dtu_scan114", 1e2),
+            ("inn-dtu", "scan118", 1e3),
+            ("l2g-dtu", "scan118", 1e2),
+        ] {
+            assert_eq!(numbers(preset, scene, &[]).2, alignment, "{preset} on {scene}");
+        }
+        let mut l = Layered::load("l2g-blender").unwrap();
+        let error = l.set("on.lego.scene.path=other").unwrap_err().to_string();
+        assert!(error.contains("cannot say which one it is"), "{error}");
+        assert!(l.set("on.lego.optim.stesp=3").unwrap_err().to_string().contains("did you mean `optim.steps`?"));
+    }
+
+    #[test]
     fn captures_have_values_of_their_own_until_others_are_set() {
         let dir = tempfile::tempdir().unwrap();
         let path = |name: &str| dir.path().join(name).to_string_lossy().into_owned();
@@ -349,10 +433,11 @@ mod tests {
         std::fs::write(&file, text).unwrap();
         let mut l = Layered::load(&file).unwrap();
         let numbers = |l: &Layered| (l.settings.optim.steps, l.settings.optim.lr);
+        let own = |l: &Layered| l.of_scene().iter().filter(|(key, _)| key.starts_with("optim.")).count();
         let scene = |l: &mut Layered, path: &str| l.set(&format!("scene.path={path}")).unwrap();
-        assert_eq!((numbers(&l), l.is_on_capture()), ((9, 0.5), false));
+        assert_eq!((numbers(&l), own(&l)), ((9, 0.5), 0));
         scene(&mut l, &path("photos"));
-        assert_eq!((numbers(&l), l.is_on_capture()), ((7, 0.25), true));
+        assert_eq!((numbers(&l), own(&l)), ((7, 0.25), 6));
         assert_eq!(l.origin("optim.lr"), Origin::Line { file: file.clone(), line: 4 });
         scene(&mut l, "builtin");
         assert_eq!(numbers(&l), (9, 0.5));
@@ -366,7 +451,7 @@ mod tests {
         // A preset without the section has nothing for captures.
         let mut plain = Layered::load("l2g-llff").unwrap();
         scene(&mut plain, &path("photos"));
-        assert!(!plain.is_on_capture());
+        assert_eq!(own(&plain), 0);
         // A file above the section wins over it too, whether it names the scene or not.
         let above = path("above.toml");
         let text = format!("base = {file:?}\n[optim]\nlr = 0.75\n[scene]\npath = {:?}\n", path("photos"));

@@ -1,19 +1,29 @@
 //! What papers call a run: its method, its scene, and where its poses started.
 
-use super::{Encoding, FieldKind, Method, NoiseKind, SceneSettings, Settings};
+use super::{CodeKind, Encoding, FieldKind, Layered, Method, NoiseKind, Origin, SceneSettings, Settings};
 use crate::scene::Layout;
 use std::path::Path;
 
 impl Settings {
-    /// `barf`, `garf`, `naive`, `l2g`, `l2g-noglobal`, `inn`, `multi-inn`, `mlp`, `implicit-mlp`, `se3-field` or `reference`.
+    /// `barf`, `garf`, `naive`, `noenc`, `l2g`, `l2g-noglobal`, `inn`, `multi-inn`, `mlp`, `implicit-mlp`, `se3-field`, `reference`,
+    /// `gaussian-reference`, or `fixed` where poses are neither true nor learned. Variants of a method that the papers compare
+    /// with it have names of their own: `inn-frozen-network`, `inn-frozen-code`, `inn-posenc`, `inn-extrinsic`.
     pub fn method_name(&self) -> &'static str {
+        let (inn, encoding) = (&self.warp.inn, self.field.encoding);
         match self.warp.method {
+            Method::None if self.scene.as_ref().is_some_and(|s| s.poses_in(s.layout()) != "truth") => "fixed",
+            Method::None if self.field.kind == FieldKind::Gaussian => "gaussian-reference",
             Method::None => "reference",
-            Method::Global if self.field.encoding == Encoding::Windowed => "barf",
+            Method::Global if encoding == Encoding::Windowed => "barf",
             Method::Global if self.field.kind == FieldKind::Gaussian => "garf",
-            Method::Global => "naive",
+            Method::Global if encoding == Encoding::Full => "naive",
+            Method::Global => "noenc",
             Method::Local if self.loss.alignment > 0.0 => "l2g",
             Method::Local => "l2g-noglobal",
+            Method::Invertible if !inn.train_network => "inn-frozen-network",
+            Method::Invertible if !inn.train_code => "inn-frozen-code",
+            Method::Invertible if inn.code == CodeKind::Posenc => "inn-posenc",
+            Method::Invertible if inn.code == CodeKind::Extrinsic => "inn-extrinsic",
             Method::Invertible => "inn",
             Method::MultiInvertible => "multi-inn",
             Method::Mlp => "mlp",
@@ -40,14 +50,26 @@ impl Settings {
         let noise = &self.noise;
         let of_scene = self.scene.as_ref().map(|s| (s.poses_in(s.layout()), noise.kind));
         match of_scene {
-            _ if self.warp.method == Method::None => None,
+            None if self.warp.method == Method::None => None,
             None => Some(format!("homography {}, translation {}", noise.homography, noise.translation)),
             Some(("truth", _)) => None,
             Some(("identity", _)) => Some("identity".to_string()),
             Some(("noisy", NoiseKind::Barf)) => Some(format!("noise {}", noise.rotation)),
-            Some(("noisy", NoiseKind::L2g)) => Some("noise per scene".to_string()),
-            Some(_) => Some("colmap".to_string()),
+            Some(("noisy", NoiseKind::L2g)) if self.has_noise_of_scene() => Some("noise per scene".to_string()),
+            Some(("noisy", NoiseKind::L2g)) => Some(format!("noise {}, {}", noise.rotation, noise.translation)),
+            Some((path, _)) if Path::new(path).is_dir() => Some("colmap".to_string()),
+            Some(_) => Some("file".to_string()),
         }
+    }
+
+    /// Whether poses are disturbed as much as the L2G-NeRF paper disturbed those of this scene.
+    fn has_noise_of_scene(&self) -> bool {
+        let of_paper = Layered::load("l2g-blender").map(|mut paper| {
+            let path = self.scene.as_ref().map_or("", |s| s.path.as_str());
+            paper.set_text("scene.path", path, Origin::Option("scene.path".into()));
+            paper.settings.noise
+        });
+        of_paper.is_ok_and(|noise| noise == self.noise)
     }
 }
 

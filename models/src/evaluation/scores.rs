@@ -23,12 +23,15 @@ pub enum Metric {
     CornerErrorPx,
     /// In the plane: PSNR of all patches together.
     PatchPsnrDb,
-    /// In the plane: 1 where the corner error is below [`SUCCESS_PX`], else 0; over several runs, their share.
+    /// In the plane: 1 where the corner error is below [`success_px`], else 0; over several runs, their share.
     Success,
 }
 
-/// Corner error in pixels below which patches count as registered (INN's supplement).
-pub const SUCCESS_PX: f64 = 5.0;
+/// Corner error in pixels below which patches count as registered: 5 in a picture of 360 x 480 (INN's supplement), and as
+/// large a part of the longer side of any other.
+pub fn success_px(height: usize, width: usize) -> f64 {
+    5.0 * height.max(width) as f64 / 480.0
+}
 
 impl Metric {
     pub const ALL: [Metric; 12] = [

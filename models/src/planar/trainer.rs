@@ -149,7 +149,7 @@ impl Training for Trainer {
         _progress: &dyn Fn(usize, usize),
     ) -> Result<evaluation::Evaluation, Error> {
         let found = self.evaluate()?;
-        results::write_evaluation(folder, &self.settings, &found)
+        results::write_evaluation(folder, &self.settings, &self.data.grid, &found)
     }
     fn finish(
         &mut self,
@@ -161,7 +161,7 @@ impl Training for Trainer {
         let found = self.evaluate()?;
         let warps = found.warps.iter().map(|w| std::array::from_fn(|i| w.0[(i / 3, i % 3)])).collect();
         metrics.last = Some(Final { entry: found.entry.clone(), seconds: seconds(), warps });
-        results::write_evaluation(folder, &self.settings, &found)?;
+        results::write_evaluation(folder, &self.settings, &self.data.grid, &found)?;
         results::write_results(folder, layered, self, &found, metrics)
     }
     fn summary(&self, last: &Final) -> String {

@@ -5,7 +5,8 @@ use super::folder::CONFIG;
 use super::metrics::Metrics;
 use crate::Error;
 use crate::config::{Layered, Settings};
-use crate::evaluation::{self, Measured, SUCCESS_PX, Scores, ViewScores};
+use crate::evaluation::{self, Measured, Scores, ViewScores, success_px};
+use crate::geometry::Grid;
 use crate::pictures::{self, Canvas};
 use crate::planar::{Evaluation, PlanarData, Trainer};
 use crate::report::{Picture, Report};
@@ -35,6 +36,7 @@ pub fn write_frame(folder: &RunFolder, trainer: &mut Trainer) -> Result<(), Erro
 pub fn write_evaluation(
     folder: &RunFolder,
     settings: &Settings,
+    grid: &Grid,
     found: &Evaluation,
 ) -> Result<evaluation::Evaluation, Error> {
     let corners: &[f64] = found.entry.corners().map_or(&[], |c| &c.per_patch);
@@ -44,7 +46,8 @@ pub fn write_evaluation(
     };
     let mut cameras = Measured::new(corners.iter().enumerate().map(patch).collect());
     cameras.mean.patch_psnr_db = Some(found.entry.psnr_db());
-    cameras.mean.success = cameras.mean.corner_error_px.map(|e| if e < SUCCESS_PX { 1.0 } else { 0.0 });
+    let below = success_px(grid.height, grid.width);
+    cameras.mean.success = cameras.mean.corner_error_px.map(|e| if e < below { 1.0 } else { 0.0 });
     let (scene, method) = (settings.scene_name(), settings.method_name().to_string());
     let evaluation = evaluation::Evaluation { scene, method, cameras, before: None, after: None };
     folder.write("evaluation.json", evaluation.to_json().as_bytes())?;

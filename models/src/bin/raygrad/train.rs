@@ -40,8 +40,9 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
         experiment = experiment.out(out);
     }
     let layered = &experiment.layered;
-    if layered.is_on_capture() {
-        eprintln!("{} is a capture: {} has settings of its own for those", layered.settings.scene_name(), layered.name);
+    let own: Vec<String> = layered.of_scene().iter().map(|(key, value)| format!("{key} = {value}")).collect();
+    if !own.is_empty() {
+        eprintln!("{} sets for {}: {}", layered.name, layered.settings.scene_name(), own.join(", "));
     }
     let stop = listen()?;
     let outcome = experiment.train_observed(&mut Progress::new(), &stop)?;
