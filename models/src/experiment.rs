@@ -13,6 +13,7 @@ use crate::Error;
 use crate::config::{ConfigError, DeviceChoice, Layered, Origin, Precision};
 use crate::evaluation::Lpips;
 use crate::planar::{PlanarData, Trainer};
+use crate::radiance::data::START;
 use crate::radiance::{Explorer, SpaceData};
 use crate::report::median;
 use crate::run::RunFolder;
@@ -88,7 +89,7 @@ impl Experiment {
         let poses = layered.settings.scene.as_ref().map_or("truth", |s| &s.poses);
         let perturbation = &layered.settings.data.perturbation;
         let copies = [
-            ("scene.poses", "initial_poses.json", !["truth", "identity", "noisy", "auto"].contains(&poses)),
+            ("scene.poses", START, !["truth", "identity", "noisy", "auto"].contains(&poses)),
             ("data.perturbation", "perturbation.json", !["drawn", ""].contains(&perturbation.as_str())),
         ];
         for (key, name, _) in copies.into_iter().filter(|(.., is_file)| *is_file) {
@@ -188,6 +189,9 @@ impl Experiment {
         self.layered.validate()?;
         let settings = &self.layered.settings;
         let data = SpaceData::load(&self.layered, loading)?;
+        if self.resume {
+            data.check_run(&self.folder())?;
+        }
         if self.lpips.is_some() {
             Lpips::check_size(data.size.width, data.size.height)?;
         }
@@ -255,13 +259,13 @@ impl Experiment {
             trainer.write_data(&folder)?;
         }
         folder.keep();
-        let left = settings.optim.steps.saturating_sub(trainer.steps_done());
+        let left = settings.optim.taken().saturating_sub(trainer.steps_done());
         if left >= TRIED {
             let seconds = seconds_per_step(&mut *trainer)?;
             observer.expected(seconds * left as f64, &trainer.learner().device_name());
         }
         run.begun = Instant::now();
-        observer.begin(&path, trainer.steps_done(), settings.optim.steps);
+        observer.begin(&path, trainer.steps_done(), settings.optim.taken());
         let interrupted = self.run_steps(&mut run, &mut *trainer, &folder, observer, stop)?;
         if !interrupted {
             observer.finishing();
@@ -300,7 +304,7 @@ impl Experiment {
         observer: &mut dyn Observer,
         stop: &AtomicBool,
     ) -> Result<bool, Error> {
-        let (steps, every) = (self.layered.settings.optim.steps, &self.layered.settings.run);
+        let (steps, every) = (self.layered.settings.optim.taken(), &self.layered.settings.run);
         if trainer.steps_done() == 0 && every.picture_every > 0 {
             trainer.write_frame(folder)?;
         }

@@ -5,7 +5,6 @@ use crate::config::{Sweep, SweepCell};
 use crate::evaluation::{Evaluation, PublishedTable, Table, published_for};
 use crate::run::checkpoint::MANIFEST;
 use crate::run::{FolderError, Metrics, RunFolder};
-use crate::scene::Layout;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -62,12 +61,7 @@ impl SweepCell {
     /// What the papers say of the same scene, method and start.
     fn published(&self) -> Vec<PublishedTable> {
         let settings = &self.layered.settings;
-        let layout = settings.scene.as_ref().map(|s| Layout::of(Path::new(&s.path)));
-        let dataset = match &layout {
-            None => "planar",
-            Some(Ok(layout)) => layout.name(),
-            Some(Err(_)) => return vec![],
-        };
+        let dataset = settings.scene.as_ref().map_or("planar", |s| s.layout().name());
         published_for(dataset, settings.start_name().as_deref(), &[&settings.scene_name()], &[settings.method_name()])
     }
 }

@@ -180,7 +180,7 @@ fn a_colmap_model_in_text() {
     let options = LoadOptions { layout: Some(Layout::Colmap), ..all() };
     let scene = load(&made.root, &options, &|_, _| ()).unwrap();
     assert_eq!([scene.train.len(), scene.test.len()], [10, 2]);
-    assert_eq!(scene.removed_distortion, Some([0.01, 0.0, 0.0, 0.0]));
+    assert_eq!(scene.train[0].removed_distortion, Some([0.01, 0.0, 0.0, 0.0]));
     assert!((scene.train[0].intrinsics.fx - 16.7).abs() < 1e-9);
     // The poses lead back to those of the JSON file; names sort as texts: r_0, r_1, r_10, ...
     let back = scene.frame.unload(&scene.train[1].pose.unwrap()).center();

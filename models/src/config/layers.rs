@@ -49,7 +49,7 @@ struct Scene {
 }
 
 /// The keys on which the scene depends.
-const SCENE: [&str; 2] = ["scene.path", "data.image"];
+const SCENE: [&str; 3] = ["scene.path", "scene.layout", "data.image"];
 
 impl When {
     /// The condition in front of a key of a file, and the key.

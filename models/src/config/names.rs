@@ -57,8 +57,8 @@ impl Settings {
             Some(("noisy", NoiseKind::Barf)) => Some(format!("noise {}", noise.rotation)),
             Some(("noisy", NoiseKind::L2g)) if self.has_noise_of_scene() => Some("noise per scene".to_string()),
             Some(("noisy", NoiseKind::L2g)) => Some(format!("noise {}, {}", noise.rotation, noise.translation)),
-            Some((path, _)) if Path::new(path).is_dir() => Some("colmap".to_string()),
-            Some(_) => Some("file".to_string()),
+            Some((path, _)) if path.ends_with(".json") => Some("file".to_string()),
+            Some(_) => Some("colmap".to_string()),
         }
     }
 
@@ -76,10 +76,8 @@ impl Settings {
 impl SceneSettings {
     /// The layout of the scene. The built-in one, and what cannot be read, is as good as a synthetic one.
     pub fn layout(&self) -> Layout {
-        match self.path.as_str() {
-            "builtin" => Layout::Blender,
-            path => Layout::of(Path::new(path)).unwrap_or(Layout::Blender),
-        }
+        let found = || Layout::of(Path::new(&self.path)).unwrap_or(Layout::Blender);
+        if self.path == "builtin" { Layout::Blender } else { Layout::from_name(&self.layout).unwrap_or_else(found) }
     }
 
     /// `poses`, with "auto" replaced by what it means for a scene of this layout: the identity for captures.
@@ -100,13 +98,15 @@ mod tests {
     fn names_of_presets_are_those_of_the_papers() {
         for (preset, method, start) in [
             ("barf-blender-original", "barf", Some("noise 0.15")),
+            ("inn-llff-frozen-code", "inn-frozen-code", Some("identity")),
+            ("nerf-gaussian-llff", "gaussian-reference", None),
             ("naive-blender", "naive", Some("noise per scene")),
             ("l2g-noglobal-blender", "l2g-noglobal", Some("noise per scene")),
             ("inn-llff", "inn", Some("identity")),
             ("nerf-blender", "reference", None),
             ("garf-llff", "garf", Some("identity")),
             ("planar-barf-original", "barf", Some("homography 0.1, translation 0.2")),
-            ("planar-multi-inn", "multi-inn", Some("homography 0.3, translation 0.1")),
+            ("planar-multi-inn", "multi-inn", Some("homography 0.1, translation 0.2")),
         ] {
             let settings = Layered::load(preset).unwrap().settings;
             assert_eq!((settings.method_name(), settings.start_name().as_deref()), (method, start), "{preset}");
@@ -116,6 +116,12 @@ mod tests {
             layered.set(set).unwrap();
             layered.settings.scene_name()
         };
+        let mut other = Layered::load("l2g-blender").unwrap();
+        other.set("noise.rotation=0.5").unwrap();
+        assert_eq!(other.settings.start_name().as_deref(), Some("noise 0.5, 0.5"));
+        let mut fixed = Layered::load("nerf-small").unwrap();
+        fixed.set("scene.poses=noisy").unwrap();
+        assert_eq!(fixed.settings.method_name(), "fixed");
         assert_eq!(scene("barf-blender", "scene.path=data/lego/"), "lego");
         assert_eq!(scene("inn-dtu", "scene.path=data/dtu_scan24"), "scan24");
         assert_eq!(scene("planar-barf", "data.image=photos/cat.jpg"), "cat");

@@ -63,6 +63,8 @@ impl Default for Data {
 pub struct SceneSettings {
     /// A folder of a known layout.
     pub path: String,
+    /// Which one, by its name, or `auto`.
+    pub layout: String,
     /// Rows, columns.
     pub image_size: [usize; 2],
     pub train_views: Count,
@@ -211,12 +213,22 @@ pub struct Loss {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Optim {
+    /// Of the schedule.
     pub steps: usize,
+    /// Steps after which training ends, before the schedule does; 0: with it.
+    pub stop_after: usize,
     pub lr: f64,
     pub lr_end: f64,
     pub lr_warp: f64,
     pub lr_warp_end: f64,
     pub warmup_pose: usize,
+}
+
+impl Optim {
+    /// The steps that are taken.
+    pub fn taken(&self) -> usize {
+        if self.stop_after == 0 { self.steps } else { self.stop_after.min(self.steps) }
+    }
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

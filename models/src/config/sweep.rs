@@ -162,7 +162,7 @@ fn cell(base: &Layered, scene: Listed, seed: Listed) -> Result<SweepCell, Config
 /// Refuses a scene or a photo that is not there.
 fn is_there(layered: &Layered) -> Result<(), ConfigError> {
     match &layered.settings.scene {
-        Some(scene) if scene.path != "builtin" => {
+        Some(scene) if scene.path != "builtin" && scene.layout == "auto" => {
             Layout::of(Path::new(&scene.path)).map_err(|e| layered.refuse("scene.path", e.to_string()))?;
         }
         None if layered.settings.data.image != "builtin" => {

@@ -3,6 +3,7 @@
 use super::error::ConfigError;
 use super::layers::Layered;
 use super::{Anneal, CodeKind, Count, DepthSettings, Dof, Encoding, FieldKind, ImageSize, Method, NoiseKind};
+use crate::scene::Layout;
 
 /// Widest layer and most bands a configuration may ask for: more is a typing error, not an experiment.
 const MAX_WIDTH: usize = 4096;
@@ -63,6 +64,11 @@ impl Layered {
         if h == 0 || w == 0 || h > MAX_SIDE || w > MAX_SIDE {
             let text = format!("expected 1 to {MAX_SIDE} rows and columns, found {h} x {w}");
             return Err(self.refuse("scene.image_size", text));
+        }
+        if scene.layout != "auto" && Layout::from_name(&scene.layout).is_none() {
+            let known: Vec<&str> = Layout::ALL.iter().map(|l| l.name()).collect();
+            let text = format!("expected \"auto\" or one of {}, found \"{}\"", known.join(", "), scene.layout);
+            return Err(self.refuse("scene.layout", text));
         }
         if !(scene.focal >= 0.0 && scene.focal.is_finite()) {
             let text = format!("expected a focal length in pixels, or 0 for none, found {}", scene.focal);

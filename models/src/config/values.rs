@@ -167,11 +167,11 @@ pub enum Count {
 }
 
 impl Count {
-    /// The number, given what "all" means.
+    /// The number, given how many there are.
     pub fn of(self, all: usize) -> usize {
         match self {
             Count::All => all,
-            Count::Of(n) => n,
+            Count::Of(n) => n.min(all),
         }
     }
     pub fn limit(self) -> Option<usize> {

@@ -16,7 +16,7 @@ use std::path::Path;
 /// One camera as it is written out.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExportCamera {
-    /// The picture's file name, as other programs look for it.
+    /// The picture's file, seen from the folder that the cameras are written for.
     pub name: String,
     pub width: usize,
     pub height: usize,
@@ -24,6 +24,8 @@ pub struct ExportCamera {
     pub focal: [f64; 2],
     /// Principal point in pixels; the first pixel's centre is at (0.5, 0.5).
     pub principal: [f64; 2],
+    /// k1, k2, p1, p2 of the picture's file, whose pinhole image the other numbers are of.
+    pub distortion: Option<[f64; 4]>,
     /// World to camera.
     pub pose: Pose,
     /// Nearest and farthest depth seen, for LLFF.
@@ -70,11 +72,18 @@ pub fn transforms_json(cameras: &[ExportCamera]) -> Result<String, ExportError> 
     check(cameras)?;
     let lens = |c: &ExportCamera| {
         let [fx, fy] = c.focal;
-        json!({
+        let mut lens = json!({
             "camera_angle_x": 2.0 * (c.width as f64 / (2.0 * fx)).atan(),
             "camera_angle_y": 2.0 * (c.height as f64 / (2.0 * fy)).atan(),
             "fl_x": fx, "fl_y": fy, "cx": c.principal[0], "cy": c.principal[1], "w": c.width, "h": c.height,
-        })
+        });
+        if let Some(distortion) = c.distortion {
+            lens["camera_model"] = json!("OPENCV");
+            for (key, k) in ["k1", "k2", "p1", "p2"].into_iter().zip(distortion) {
+                lens[key] = json!(k);
+            }
+        }
+        lens
     };
     let frame = |c: &ExportCamera| {
         let world = c.pose.inverse();
@@ -91,7 +100,7 @@ pub fn transforms_json(cameras: &[ExportCamera]) -> Result<String, ExportError> 
     Ok(serde_json::to_string_pretty(&all).unwrap_or_default())
 }
 
-/// The three files of a COLMAP text model. Poses are world to camera, as here; cameras are `PINHOLE`, one for all
+/// The three files of a COLMAP text model, which names images within the folder `images`. Poses are world to camera, as here; cameras are `PINHOLE`, or `OPENCV` with a distortion, one for all
 /// pictures that share size and lens. There are no points: `points3D.txt` has a head only.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Colmap {
@@ -118,7 +127,8 @@ impl Colmap {
                 return Err(ExportError::Camera { view, name: c.name.clone(), problem });
             }
             let same = |o: &&ExportCamera| {
-                (o.width, o.height, o.focal, o.principal) == (c.width, c.height, c.focal, c.principal)
+                (o.width, o.height, o.focal, o.principal, o.distortion)
+                    == (c.width, c.height, c.focal, c.principal, c.distortion)
             };
             let lens = lenses.iter().position(same).unwrap_or_else(|| {
                 lenses.push(c);
@@ -139,12 +149,16 @@ impl Colmap {
                 t.y,
                 t.z,
                 lens + 1,
-                c.name
+                c.name.strip_prefix("images/").unwrap_or(&c.name)
             );
         }
         for (i, c) in lenses.iter().enumerate() {
             let ([fx, fy], [cx, cy]) = (c.focal, c.principal);
-            let _ = writeln!(out.cameras, "{} PINHOLE {} {} {fx} {fy} {cx} {cy}", i + 1, c.width, c.height);
+            let (model, rest) = match c.distortion {
+                None => ("PINHOLE", String::new()),
+                Some([k1, k2, p1, p2]) => ("OPENCV", format!(" {k1} {k2} {p1} {p2}")),
+            };
+            let _ = writeln!(out.cameras, "{} {model} {} {} {fx} {fy} {cx} {cy}{rest}", i + 1, c.width, c.height);
         }
         Ok(out)
     }
@@ -182,6 +196,9 @@ pub fn poses_bounds(cameras: &[ExportCamera]) -> Result<Vec<u8>, ExportError> {
                 "LLFF's format has the principal point in the middle, and this is ({cx}, {cy})"
             )));
         }
+        if c.distortion.is_some() {
+            return Err(refuse("LLFF's format has no lens distortion, and its picture's file has one".to_string()));
+        }
         let bounds = c.bounds.filter(|[near, far]| 0.0 < *near && near <= far && far.is_finite());
         let [near, far] =
             bounds.ok_or_else(|| refuse("it has no near and far depth, which LLFF's format asks for".into()))?;
@@ -216,6 +233,7 @@ mod tests {
             height: 480,
             focal: [500.25, 500.25],
             principal: [320.0, 240.0],
+            distortion: None,
             pose: Pose::exp(&[0.3 * i as f64, -0.2, 1.0 + i as f64, 0.5, -1.0, 2.0]),
             bounds: Some([1.5, 20.0 + i as f64]),
         };
@@ -230,8 +248,11 @@ mod tests {
     /// Reads as section 1.6 of the specification does: R = F R_c^T, t = -F R_c^T t_c.
     #[test]
     fn transforms_read_back_are_the_poses() {
-        let cameras = cameras();
+        let mut cameras = cameras();
+        cameras[1].distortion = Some([0.1, -0.2, 0.0, 0.003]);
         let json: serde_json::Value = serde_json::from_str(&transforms_json(&cameras).unwrap()).unwrap();
+        let frame = |i: usize| &json["frames"][i];
+        assert_eq!([&frame(1)["k2"], &frame(1)["p2"], &frame(0)["k2"]], [&json!(-0.2), &json!(0.003), &json!(null)]);
         let focal = 0.5 * 640.0 / (0.5 * json["camera_angle_x"].as_f64().unwrap()).tan();
         assert!((focal - 500.25).abs() < 1e-9 && json["fl_y"] == 500.25 && json["h"] == 480);
         for (frame, camera) in json["frames"].as_array().unwrap().iter().zip(&cameras) {
@@ -247,6 +268,7 @@ mod tests {
     fn colmap_read_back_is_the_poses() {
         let mut cameras = cameras();
         cameras[2].focal = [400.0, 410.0];
+        cameras[3].distortion = Some([0.1, -0.2, 0.0, 0.003]);
         let model = Colmap::new(&cameras).unwrap();
         let dir = tempfile::tempdir().unwrap();
         model.write(dir.path()).unwrap();
@@ -256,7 +278,14 @@ mod tests {
         // Every image has a second line for its points, which is empty.
         assert_eq!(body.len(), 2 * cameras.len());
         let lenses: Vec<String> = read("cameras.txt").lines().filter(|l| !l.starts_with('#')).map(Into::into).collect();
-        assert_eq!(lenses, ["1 PINHOLE 640 480 500.25 500.25 320 240", "2 PINHOLE 640 480 400 410 320 240"]);
+        assert_eq!(
+            lenses,
+            [
+                "1 PINHOLE 640 480 500.25 500.25 320 240",
+                "2 PINHOLE 640 480 400 410 320 240",
+                "3 OPENCV 640 480 500.25 500.25 320 240 0.1 -0.2 0 0.003"
+            ]
+        );
         for (i, camera) in cameras.iter().enumerate() {
             assert_eq!(body[2 * i + 1], "");
             let fields: Vec<&str> = body[2 * i].splitn(10, ' ').collect();
@@ -264,7 +293,7 @@ mod tests {
             let q = UnitQuaternion::from_quaternion(Quaternion::new(x[1], x[2], x[3], x[4]));
             let rotation = q.to_rotation_matrix().into_inner();
             assert_near(&Pose { rotation, translation: Vector3::new(x[5], x[6], x[7]) }, &camera.pose);
-            assert_eq!((fields[8], fields[9]), (if i == 2 { "2" } else { "1" }, camera.name.as_str()));
+            assert_eq!((fields[8], fields[9]), (["1", "1", "2", "3"][i], &camera.name["images/".len()..]));
         }
         assert!(read("points3D.txt").lines().all(|l| l.starts_with('#')));
     }
@@ -298,6 +327,7 @@ mod tests {
         assert!(llff(|c| c.focal[1] = 400.0).contains("camera 1 (`images/IMG 1.JPG`)"));
         assert!(llff(|c| c.principal[0] = 300.0).contains("principal point"));
         assert!(llff(|c| c.bounds = None).contains("near and far"));
+        assert!(llff(|c| c.distortion = Some([0.1, 0.0, 0.0, 0.0])).contains("no lens distortion"));
         assert!(llff(|c| c.pose.translation.x = f64::NAN).contains("exported pose 1"));
         assert!(transforms_json(&[]).is_err());
         assert!(transforms_json(&with(|c| c.focal[0] = 0.0)).is_err());

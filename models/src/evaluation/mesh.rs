@@ -79,7 +79,7 @@ const CHUNK: usize = 16384;
 pub type DensityError = Box<dyn std::error::Error + Send + Sync>;
 
 impl MeshOptions {
-    fn check(&self) -> Result<(), MeshError> {
+    pub fn check(&self) -> Result<(), MeshError> {
         let finite = |i: usize| self.low[i].is_finite() && self.high[i].is_finite() && self.low[i] < self.high[i];
         for (i, axis) in ['x', 'y', 'z'].into_iter().enumerate() {
             if !finite(i) {

@@ -74,7 +74,7 @@ impl Table {
         out
     }
 
-    /// A LaTeX `tabular`, the best of each group and column bold.
+    /// A LaTeX `tabular`, the best of each group and column bold, of those that find the poses.
     pub fn to_latex(&self) -> String {
         let rows = self.rows();
         let columns = "r".repeat(self.scenes().len() + 1);
@@ -88,10 +88,14 @@ impl Table {
             if first {
                 out += "\\hline\n";
             }
-            let group: Vec<&Row> = rows.iter().filter(|r| (r.metric, r.stage) == (row.metric, row.stage)).collect();
+            // Who is given the poses does not compete.
+            let given = ["reference", "gaussian-reference", "fixed"];
+            let competes = |r: &Row| !given.contains(&r.method.as_str()) && !r.method.starts_with("nerf-");
+            let group: Vec<&Row> =
+                rows.iter().filter(|r| (r.metric, r.stage) == (row.metric, row.stage) && competes(r)).collect();
             let cells = row.cells().enumerate().map(|(i, v)| {
                 let text = number(row.metric, v).replace('±', "$\\pm$");
-                if is_best(row.metric, v, group.iter().map(|r| r.cells().nth(i).flatten())) {
+                if competes(row) && is_best(row.metric, v, group.iter().map(|r| r.cells().nth(i).flatten())) {
                     format!("\\textbf{{{text}}}")
                 } else {
                     text

@@ -8,11 +8,13 @@ use crate::geometry::Pose;
 use crate::run::files::WriteError;
 use crate::scene::make_scene::{MakeError, MakeOptions, make_scene};
 use crate::scene::noise::{InitialPoses, NoiseError, PoseStart, Side};
-use crate::scene::{self, DepthRange, Layout, LoadOptions, Scene, SceneError, View};
+use crate::scene::{self, DepthRange, Layout, LoadOptions, NamedPoses, Scene, SceneError, View, World};
 use std::path::Path;
 
 /// The path that stands for the procedural scene.
 const BUILTIN: &str = "builtin";
+/// The file of a run with the poses that it starts from.
+pub const START: &str = "initial_poses.json";
 /// Its training views.
 const VIEWS: usize = 100;
 
@@ -73,6 +75,7 @@ impl SpaceData {
             train_limit: wanted.train_views.limit(),
             val_limit: wanted.val_views.limit(),
             test_limit: wanted.test_views.limit(),
+            layout: Layout::from_name(&wanted.layout),
             focal: (wanted.focal > 0.0).then_some(wanted.focal),
             no_train_depths: true,
             ..LoadOptions::default()
@@ -96,7 +99,10 @@ impl SpaceData {
             ("noisy", NoiseKind::L2g) => {
                 InitialPoses::L2g { rotation: noise.rotation, translation: noise.translation }.draw(names(), seed)?
             }
-            (file, _) => PoseStart::load(Path::new(file), names())?,
+            (file, _) => match NamedPoses::load(Path::new(file)).map_err(NoiseError::from)? {
+                Some(named) => started_from(&named, Path::new(file), &scene)?,
+                None => PoseStart::load(Path::new(file), names())?,
+            },
         };
         if settings.train.as_ref().is_some_and(|t| t.ndc) {
             let away = start.poses.iter().filter(|p| p.rotation[(2, 2)] <= 0.0).count();
@@ -109,8 +115,31 @@ impl SpaceData {
                 return Err(layered.refuse("train.ndc", text).into());
             }
         }
+        if settings.train.as_ref().is_some_and(|t| t.depth == DepthSettings::Auto) {
+            let centers: Vec<_> = start.poses.iter().map(Pose::center).collect();
+            let apart = centers.iter().map(|c| (c - centers[0]).norm()).fold(0.0, f64::max);
+            if apart < 1e-6 {
+                let text = "\"auto\" takes near and far from the spread of the cameras, and all cameras start in one place: \
+                            expected \"metric\", \"inverse\" or \"scene\"";
+                return Err(layered.refuse("train.depth", text).into());
+            }
+        }
         let size = ImageSize { height, width };
         Ok(SpaceData { size, start, truth, scene, seed })
+    }
+
+    /// Names and reference poses of the training views.
+    pub fn names(&self) -> impl Iterator<Item = (&str, Option<Pose>)> {
+        self.scene.train.iter().map(|v| (v.name.as_str(), v.pose))
+    }
+
+    /// Refuses a scene that is not the one that the run in a folder began with.
+    pub fn check_run(&self, folder: &Path) -> Result<(), SpaceDataError> {
+        let path = folder.join(START);
+        if path.exists() {
+            PoseStart::check_views(&path, self.names())?;
+        }
+        Ok(())
     }
 
     /// The settings with the scene's own depths, where they ask for them: from near to far, and where L2G's noise displaced
@@ -161,6 +190,25 @@ impl SpaceData {
     }
 }
 
+/// Poses of other programs as a start. Those of another world are aligned with the true ones, as the INN paper does it with
+/// COLMAP's; where nothing is true they are taken for those of the scene's files. Views without a pose start at the identity.
+fn started_from(named: &NamedPoses, path: &Path, scene: &Scene) -> Result<PoseStart, SpaceDataError> {
+    let views: Vec<&str> = scene.train.iter().map(|v| v.name.as_str()).collect();
+    let mut poses = named.of_views(path, &views)?;
+    if named.world == World::Other {
+        let both = poses.iter().zip(&scene.train).filter_map(|(found, view)| Some(((*found)?, view.pose?)));
+        let (found, truth): (Vec<Pose>, Vec<Pose>) = both.unzip();
+        if truth.len() > 1 {
+            let similarity = Alignment::of_inn(truth.len()).fit(&found, &truth)?;
+            poses.iter_mut().flatten().for_each(|p| *p = similarity.align(&[*p])[0]);
+        } else {
+            poses.iter_mut().flatten().for_each(|p| *p = scene.frame.load(p));
+        }
+    }
+    let poses = poses.into_iter().map(|p| p.unwrap_or_else(Pose::identity)).collect();
+    Ok(PoseStart { poses, noise: None })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -191,5 +239,76 @@ mod tests {
         assert!((degrees - 0.1f64.to_degrees()).abs() < 1e-6 && centers < 1e-3, "{degrees} {centers}");
         data.truth = None;
         assert_eq!(data.pose_scores(&found).unwrap(), Measured::default());
+    }
+
+    /// A made scene, its settings, and the data of them.
+    fn made(preset: &str, set: &[&str]) -> (tempfile::TempDir, Layered) {
+        let dir = tempfile::tempdir().unwrap();
+        make_scene(dir.path(), &MakeOptions { views: 12, size: 8, seed: 0 }, &|_, _| {}).unwrap();
+        let mut layered = Layered::load(preset).unwrap();
+        layered.set(&format!("scene.path={}", dir.path().display())).unwrap();
+        ["scene.image_size=[8,8]"].iter().chain(set).for_each(|s| layered.set(s).unwrap());
+        (dir, layered)
+    }
+
+    #[test]
+    fn poses_of_another_program_are_aligned_and_matched_by_name() {
+        let (dir, mut layered) = made("barf-small", &[]);
+        let data = SpaceData::load(&layered, &|_, _| {}).unwrap();
+        let truth = data.truth.clone().unwrap();
+        // Another world, another order, one view missing.
+        let turn = Pose::exp(&[0.3, -0.5, 0.1, 0.0, 0.0, 0.0]);
+        let world = Similarity { scale: 3.0, rotation: turn.rotation, ..Similarity::identity() };
+        let camera = |(view, pose): (&View, &Pose)| crate::evaluation::ExportCamera {
+            name: format!("{}.png", view.name),
+            width: 8,
+            height: 8,
+            focal: [9.0, 9.0],
+            principal: [4.0, 4.0],
+            distortion: None,
+            pose: *pose,
+            bounds: None,
+        };
+        let mut cameras: Vec<_> = data.scene.train.iter().zip(&world.align(&truth)).map(camera).collect();
+        cameras.reverse();
+        let missing = cameras.len() - 1 - 4;
+        cameras.remove(missing);
+        let (model, json) = (dir.path().join("model"), dir.path().join("cameras.json"));
+        std::fs::create_dir(&model).unwrap();
+        crate::evaluation::Colmap::new(&cameras).unwrap().write(&model).unwrap();
+        std::fs::write(&json, crate::evaluation::transforms_json(&cameras).unwrap()).unwrap();
+        for (path, start) in [(&model, "colmap"), (&json, "file")] {
+            layered.set(&format!("scene.poses={}", path.display())).unwrap();
+            assert_eq!(layered.settings.start_name().as_deref(), Some(start));
+            let found = SpaceData::load(&layered, &|_, _| {}).unwrap().start.poses;
+            for (i, (a, b)) in found.iter().zip(&truth).enumerate() {
+                let expected = if i == 4 { Pose::identity() } else { *b };
+                let apart = (a.rotation - expected.rotation).norm() + (a.translation - expected.translation).norm();
+                assert!(apart < 1e-6, "view {i} is off by {apart}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_run_knows_its_scene() {
+        let (_dir, layered) = made("barf-small", &[]);
+        let data = SpaceData::load(&layered, &|_, _| {}).unwrap();
+        let run = tempfile::tempdir().unwrap();
+        data.check_run(run.path()).unwrap();
+        std::fs::write(run.path().join(START), data.start.to_json(None, data.names())).unwrap();
+        data.check_run(run.path()).unwrap();
+        let other = tempfile::tempdir().unwrap();
+        make_scene(other.path(), &MakeOptions { views: 12, size: 8, seed: 1 }, &|_, _| {}).unwrap();
+        let mut layered = layered;
+        layered.set(&format!("scene.path={}", other.path().display())).unwrap();
+        let error = SpaceData::load(&layered, &|_, _| {}).unwrap().check_run(run.path()).unwrap_err().to_string();
+        assert!(error.contains("not the one that the run learned from"), "{error}");
+    }
+
+    #[test]
+    fn depths_of_cameras_in_one_place_are_refused() {
+        let (_dir, layered) = made("l2g-blender", &["scene.poses=identity"]);
+        let error = SpaceData::load(&layered, &|_, _| {}).unwrap_err().to_string();
+        assert!(error.contains("`train.depth`") && error.contains("start in one place"), "{error}");
     }
 }

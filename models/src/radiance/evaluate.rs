@@ -123,6 +123,8 @@ mod tests {
         let mask = Some((0..n).map(inside).collect());
         let mut view = View {
             name: "v".into(),
+            file: "v.png".into(),
+            removed_distortion: None,
             pixels: vec![[51, 102, 204, 255]; n],
             transparent: false,
             intrinsics,

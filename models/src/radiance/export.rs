@@ -5,6 +5,7 @@ use super::explorer::Explorer;
 use crate::Error;
 use crate::evaluation::ExportCamera;
 use crate::scene::DepthRange;
+use std::path::Path;
 
 /// The near plane of scenes with inverse depth lies at this part of the nearest depth seen.
 const NEAR_PART: f64 = 0.75;
@@ -25,15 +26,22 @@ impl Explorer {
         let camera = |(view, pose): (&crate::scene::View, _)| {
             let lens = &view.intrinsics;
             ExportCamera {
-                name: view.name.clone(),
+                name: exported_name(&scene.root, &view.file),
                 width: lens.width,
                 height: lens.height,
                 focal: [lens.fx, lens.fy],
                 principal: [lens.cx, lens.cy],
+                distortion: view.removed_distortion,
                 pose: scene.frame.unload(pose),
                 bounds: Some(bounds.map(|d| d / scene.frame.scale)),
             }
         };
         Ok(scene.train.iter().zip(&aligned).map(camera).collect())
     }
+}
+
+/// The file of an image as seen from the scene's folder.
+fn exported_name(root: &Path, file: &Path) -> String {
+    let name = file.strip_prefix(root).unwrap_or(file).to_string_lossy().replace('\\', "/");
+    name.strip_prefix("./").map_or(name.clone(), String::from)
 }

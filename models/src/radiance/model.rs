@@ -339,8 +339,17 @@ mod tests {
     fn packed_pixels_have_the_colors_of_the_view() {
         let pixels = vec![[255, 128, 0, 255], [10, 200, 90, 51], [1, 2, 3, 0], [0, 0, 255, 254]];
         let intrinsics = Intrinsics { fx: 1.0, fy: 1.0, cx: 1.0, cy: 1.0, height: 2, width: 2, distortion: None };
-        let view =
-            View { name: "v".into(), pixels, transparent: true, intrinsics, pose: None, mask: None, depth: None };
+        let view = View {
+            name: "v".into(),
+            file: "v.png".into(),
+            pixels,
+            transparent: true,
+            intrinsics,
+            removed_distortion: None,
+            pose: None,
+            mask: None,
+            depth: None,
+        };
         let all = Tensor::data("pixels", Shape::new(&[&Axis::new("pixel", 4)], 1).with_dtype(DType::U32));
         let bindings: Bindings =
             [("pixels".to_string(), Array::integers(all.shape(), packed(&view).collect()))].into_iter().collect();

@@ -1,6 +1,6 @@
 //! The files of a 3D run: where it starts, frames of the animation, rendered views, poses, measurements and report.
 
-use super::data::{SpaceData, SpaceDataError};
+use super::data::{START, SpaceData, SpaceDataError};
 use super::evaluate::{Found, evaluate};
 use super::explorer::Explorer;
 use crate::Error;
@@ -29,7 +29,7 @@ pub struct Written {
 
 /// What the run starts from, before it begins.
 pub fn write_data(folder: &RunFolder, data: &SpaceData) -> Result<(), Error> {
-    folder.write("initial_poses.json", data.start.to_json(Some(data.seed)).as_bytes())?;
+    folder.write(START, data.start.to_json(Some(data.seed), data.names()).as_bytes())?;
     Ok(())
 }
 

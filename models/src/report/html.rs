@@ -189,7 +189,11 @@ pub fn median(values: &[f64]) -> f64 {
 /// 75 seconds as `1:15 min`.
 pub fn duration(seconds: f64) -> String {
     let whole = seconds.round() as u64;
-    if whole < 60 { format!("{seconds:.1} s") } else { format!("{}:{:02} min", whole / 60, whole % 60) }
+    match whole {
+        ..60 => format!("{seconds:.1} s"),
+        60..7200 => format!("{}:{:02} min", whole / 60, whole % 60),
+        _ => format!("{}:{:02} h", whole / 3600, whole / 60 % 60),
+    }
 }
 
 fn escape(text: &str) -> String {

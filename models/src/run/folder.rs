@@ -26,6 +26,11 @@ pub enum FolderError {
         if .difference.is_none() { ", or continue it with `--resume`" } else { "" }
     )]
     Occupied { path: PathBuf, difference: Option<String> },
+    #[error(
+        "the folder {} holds this run, which was cut off before its first checkpoint; remove the folder to begin anew",
+        .path.display()
+    )]
+    CutOff { path: PathBuf },
     #[error("nothing to resume: {} holds no checkpoint", .path.display())]
     NothingToResume { path: PathBuf },
     #[error("there is no run in {}: {lacks}", .path.display())]
@@ -60,7 +65,12 @@ impl RunFolder {
             match RunFolder::held_settings(path)? {
                 Some(held) => {
                     let (path, difference) = (path.to_path_buf(), difference(&held, settings));
-                    return Err(FolderError::Occupied { path, difference });
+                    let cut_off = difference.is_none() && !path.join(MANIFEST).exists();
+                    return Err(if cut_off {
+                        FolderError::CutOff { path }
+                    } else {
+                        FolderError::Occupied { path, difference }
+                    });
                 }
                 None if is_empty(path)? => {}
                 None => return Err(FolderError::Foreign { path: path.to_path_buf() }),
@@ -194,6 +204,10 @@ pub fn difference(held: &Settings, wanted: &Settings) -> Option<String> {
         }
         leaves
     };
+    if held.scene.is_some() != wanted.scene.is_some() {
+        let [there, here] = [held, wanted].map(|s| if s.scene.is_some() { "in space" } else { "in the plane" });
+        return Some(format!("there it is one {there}, here one {here}"));
+    }
     let differs = flat(held).into_iter().zip(flat(wanted)).find(|(a, b)| a != b);
     differs.map(|((key, held), (_, wanted))| format!("there `{key}` is {held}, here {wanted}"))
 }

@@ -24,11 +24,29 @@ pub(super) fn lacks(root: &Path) -> Option<String> {
 
 /// The folder of the model and whether it is binary.
 fn model(root: &Path) -> Option<(PathBuf, bool)> {
-    let folders = ["sparse/0", "sparse", "colmap/sparse/0"].map(|f| root.join(f));
+    model_of(["sparse/0", "sparse", "colmap/sparse/0"].map(|f| root.join(f)))
+}
+
+fn model_of(folders: impl IntoIterator<Item = PathBuf>) -> Option<(PathBuf, bool)> {
     folders.into_iter().find_map(|folder| {
         let has = |extension: &str| folder.join(format!("cameras.{extension}")).is_file();
         if has("bin") { Some((folder, true)) } else { has("txt").then_some((folder, false)) }
     })
+}
+
+/// The poses of a model in this folder or in those of a scene, by the names of images.
+pub(super) fn poses(folder: &Path) -> Result<Vec<(String, Pose)>, SceneError> {
+    let Some((found, binary)) = model_of([folder.into()]).or_else(|| model(folder)) else {
+        let message = "no model of COLMAP: neither cameras.bin nor cameras.txt".to_string();
+        return Err(SceneError::Format { path: folder.into(), message });
+    };
+    let file = found.join(if binary { "images.bin" } else { "images.txt" });
+    let images = if binary { binary_images(&file)? } else { text_images(&file)? };
+    let checked = |image: Image| {
+        let pose = check_pose(image.pose, &file, || format!("image {}", image.name))?;
+        Ok((image.name, pose))
+    };
+    images.into_iter().map(checked).collect()
 }
 
 pub(super) fn list(root: &Path) -> Result<Listing, SceneError> {

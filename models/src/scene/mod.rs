@@ -14,6 +14,7 @@ mod frame;
 mod json;
 mod llff;
 pub mod make_scene;
+mod named_poses;
 pub mod noise;
 mod normalise;
 mod numpy;
@@ -24,6 +25,7 @@ mod transforms;
 
 pub use error::SceneError;
 pub use frame::WorldFrame;
+pub use named_poses::{NamedPoses, World};
 pub use noise::{InitialPoses, NoiseError, PoseStart};
 
 use crate::geometry::Pose;
@@ -61,11 +63,15 @@ impl Intrinsics {
 pub struct View {
     /// The image as the scene's own files call it.
     pub name: String,
+    /// Its file.
+    pub file: PathBuf,
     /// Red, green, blue and opacity of every pixel, row by row.
     pub pixels: Vec<[u8; 4]>,
     /// Whether the image can be transparent.
     pub transparent: bool,
     pub intrinsics: Intrinsics,
+    /// Lens distortion of the file, which was removed, see [`Intrinsics::distortion`].
+    pub removed_distortion: Option<[f64; 4]>,
     /// Reference pose; `None` where nobody knows it.
     pub pose: Option<Pose>,
     /// The mask that comes with the image, one value a pixel: whether all of it is foreground.
@@ -192,8 +198,6 @@ pub struct Scene {
     pub depth: DepthRange,
     /// From the world of the files to the loaded one.
     pub frame: WorldFrame,
-    /// Lens distortion that was removed (of the first view; see [`Intrinsics::distortion`]).
-    pub removed_distortion: Option<[f64; 4]>,
     /// What had to be assumed, a sentence each.
     pub notes: Vec<String>,
 }
@@ -304,17 +308,7 @@ pub fn load(root: &Path, options: &LoadOptions, progress: &(dyn Fn(usize, usize)
         Some(_) => views.split_off(trained),
         None => test.iter().take(options.val_limit.unwrap_or(usize::MAX)).cloned().collect(),
     };
-    Ok(Scene {
-        layout,
-        root: root.into(),
-        val,
-        test,
-        depth,
-        frame: listing.frame,
-        removed_distortion: listing.train[0].intrinsics.distortion.filter(|d| d.iter().any(|k| *k != 0.0)),
-        notes: listing.notes,
-        train: views,
-    })
+    Ok(Scene { layout, root: root.into(), val, test, depth, frame: listing.frame, notes: listing.notes, train: views })
 }
 
 fn check_depth(depth: DepthRange, from: &str) -> Result<(), SceneError> {

@@ -2,7 +2,8 @@
 //!
 //! BARF moves the world under a camera, P = P_gt o Exp(0.15 N), so that cameras keep looking at the object; L2G moves the
 //! camera itself, P = E o P_gt with E = [Exp(n_r N) | n_t N]. All noise of a run is in one JSON file, since no seed
-//! reproduces it elsewhere.
+//! reproduces it elsewhere; its poses are of the loaded world ([`super::WorldFrame`]). Poses of other programs are
+//! [`super::NamedPoses`].
 
 use crate::data::Random;
 use crate::geometry::Pose;
@@ -48,12 +49,29 @@ struct File {
     order: String,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     seed: Option<u32>,
+    /// The views that the rows are of, and their reference poses where those are known: what the file was written for.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    views: Vec<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    reference: Option<Vec<[f64; 12]>>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     side: Option<Side>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     noise: Option<Vec<[f64; 12]>>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     poses: Option<Vec<[f64; 12]>>,
+}
+
+impl File {
+    fn read(path: &Path) -> Result<File, NoiseError> {
+        let format = |message: String| NoiseError::Format { path: path.into(), message };
+        let text = std::fs::read_to_string(path).map_err(|source| NoiseError::Read { path: path.into(), source })?;
+        let mut json = serde_json::Deserializer::from_str(&text);
+        serde_path_to_error::deserialize(&mut json).map_err(|e| match e.path().to_string() {
+            field if field == "." => format(e.inner().to_string()),
+            field => format(format!("`{field}`: {}", e.inner())),
+        })
+    }
 }
 
 const ORDER: &str = "one camera a row: [R | t] row by row, world to camera; side `world`: pose = truth o noise, `camera`: noise o truth";
@@ -65,36 +83,24 @@ pub enum NoiseError {
     Read { path: PathBuf, source: std::io::Error },
     #[error("{}: not a file of poses: {message}", .path.display())]
     Format { path: PathBuf, message: String },
+    #[error(transparent)]
+    Scene(#[from] super::SceneError),
     #[error("{}: `{list}` has {found} cameras, but the scene has {expected} training views", .path.display())]
     Count { path: PathBuf, list: &'static str, found: usize, expected: usize },
+    #[error(
+        "the scene is not the one that the run learned from: its training view {} `{found}` {difference}, see {}",
+        .at + 1, .path.display()
+    )]
+    OtherScene { path: PathBuf, at: usize, found: String, difference: String },
     #[error(
         "{what} needs reference poses, but view `{view}` has none; start from the identity or from a file of poses"
     )]
     NoTruth { what: String, view: String },
 }
 
-/// L2G's standard deviations (rotation, translation) for the scenes of NeRF's synthetic set.
-pub const L2G_NOISE: [(&str, f64, f64); 8] = [
-    ("chair", 0.01, 0.4),
-    ("drums", 0.05, 0.5),
-    ("ficus", 0.03, 0.3),
-    ("hotdog", 0.04, 0.4),
-    ("lego", 0.07, 0.5),
-    ("materials", 0.04, 0.3),
-    ("mic", 0.04, 0.5),
-    ("ship", 0.09, 0.7),
-];
-
 impl InitialPoses {
     /// BARF's noise as published.
     pub const BARF: InitialPoses = InitialPoses::Barf { deviation: 0.15 };
-
-    /// L2G's noise for a scene of NeRF's synthetic set, else that of its settings' defaults.
-    pub fn l2g_of(scene: &str) -> InitialPoses {
-        let listed = L2G_NOISE.iter().find(|(name, ..)| *name == scene);
-        let (rotation, translation) = listed.map_or((0.03, 0.3), |(_, r, t)| (*r, *t));
-        InitialPoses::L2g { rotation, translation }
-    }
 
     /// Draws the noise of a seed. `views` gives name and reference pose of every training view.
     pub fn draw<'a>(
@@ -149,12 +155,7 @@ impl PoseStart {
     ) -> Result<PoseStart, NoiseError> {
         let views: Vec<(&str, Option<Pose>)> = views.into_iter().collect();
         let format = |message: String| NoiseError::Format { path: path.into(), message };
-        let text = std::fs::read_to_string(path).map_err(|source| NoiseError::Read { path: path.into(), source })?;
-        let mut json = serde_json::Deserializer::from_str(&text);
-        let file: File = serde_path_to_error::deserialize(&mut json).map_err(|e| match e.path().to_string() {
-            field if field == "." => format(e.inner().to_string()),
-            field => format(format!("`{field}`: {}", e.inner())),
-        })?;
+        let file = File::read(path)?;
         let checked = |list: &'static str, rows: Vec<[f64; 12]>| {
             if rows.len() != views.len() {
                 let (found, expected) = (rows.len(), views.len());
@@ -174,16 +175,57 @@ impl PoseStart {
             }
             (Some(_), None, _) => Err(format("`noise` needs `side`: expected \"world\" or \"camera\"".to_string())),
             (None, _, Some(poses)) => Ok(PoseStart { poses: checked("poses", poses)?, noise: None }),
-            (None, _, None) => Err(format("expected `poses`, or `noise` and `side`".to_string())),
+            (None, _, None) => {
+                let expected = "expected `poses`, or `noise` and `side` (as in initial_poses.json of a run), `views` and \
+                                `aligned` (as in its poses.json), or `frames` (as in transforms.json)";
+                Err(format(expected.to_string()))
+            }
         }
     }
 
-    /// The file that loads as this start.
-    pub fn to_json(&self, seed: Option<u32>) -> String {
+    /// Refuses views other than those that a file was written for: of other names, or of other reference poses. Files of
+    /// poses that say nothing of views fit all.
+    pub fn check_views<'a>(
+        path: &Path,
+        views: impl IntoIterator<Item = (&'a str, Option<Pose>)>,
+    ) -> Result<(), NoiseError> {
+        let file = File::read(path)?;
+        let views: Vec<(&str, Option<Pose>)> = views.into_iter().collect();
+        if file.views.is_empty() {
+            return Ok(());
+        }
+        if file.views.len() != views.len() {
+            let (found, expected) = (file.views.len(), views.len());
+            return Err(NoiseError::Count { path: path.into(), list: "views", found, expected });
+        }
+        for (at, (name, pose)) in views.iter().enumerate() {
+            let other = |difference: String| {
+                Err(NoiseError::OtherScene { path: path.into(), at, found: name.to_string(), difference })
+            };
+            if file.views[at] != *name {
+                return other(format!("was `{}`", file.views[at]));
+            }
+            let known = file.reference.as_ref().and_then(|rows| rows.get(at)).map(|row| Pose::from_rows(row));
+            let apart = known.zip(*pose).map_or(0.0, |(a, b)| {
+                (a.rotation - b.rotation).norm() + (a.translation - b.translation).norm() / (1.0 + b.translation.norm())
+            });
+            if apart > 1e-6 {
+                return other("had another reference pose".to_string());
+            }
+        }
+        Ok(())
+    }
+
+    /// The file that loads as this start, of these views.
+    pub fn to_json<'a>(&self, seed: Option<u32>, views: impl IntoIterator<Item = (&'a str, Option<Pose>)>) -> String {
+        let (names, reference): (Vec<&str>, Vec<Option<Pose>>) = views.into_iter().unzip();
+        let reference: Option<Vec<Pose>> = reference.into_iter().collect();
         let rows = |poses: &[Pose]| poses.iter().map(|p| p.to_rows()).collect();
         let file = File {
             order: ORDER.to_string(),
             seed,
+            views: names.iter().map(|n| n.to_string()).collect(),
+            reference: reference.as_deref().map(rows),
             side: self.noise.as_ref().map(|n| n.0),
             noise: self.noise.as_ref().map(|n| rows(&n.1)),
             poses: Some(rows(&self.poses)),
@@ -210,7 +252,8 @@ mod tests {
         let truth = cameras(7);
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("poses.json");
-        for kind in [InitialPoses::BARF, InitialPoses::l2g_of("lego"), InitialPoses::Truth, InitialPoses::Identity] {
+        let l2g = InitialPoses::L2g { rotation: 0.07, translation: 0.5 };
+        for kind in [InitialPoses::BARF, l2g, InitialPoses::Truth, InitialPoses::Identity] {
             let start = kind.draw(views(&truth), 3).unwrap();
             assert_eq!(start, kind.draw(views(&truth), 3).unwrap());
             for (i, pose) in start.poses.iter().enumerate() {
@@ -223,12 +266,12 @@ mod tests {
                 };
                 assert_eq!(*pose, expected);
             }
-            std::fs::write(&path, start.to_json(Some(3))).unwrap();
+            std::fs::write(&path, start.to_json(Some(3), views(&truth))).unwrap();
             assert_eq!(PoseStart::load(&path, views(&truth)).unwrap(), start);
         }
     }
 
-    /// BARF's mean angle is 0.15 sqrt(8 / pi) = 13.7 degrees; L2G's translations have the table's deviation.
+    /// BARF's mean angle is 0.15 sqrt(8 / pi) = 13.7 degrees; L2G's translations have their deviation.
     #[test]
     fn sizes_of_the_noise() {
         let truth = cameras(2000);
@@ -236,10 +279,37 @@ mod tests {
         let angle = |p: &Pose| ((p.rotation.trace() - 1.0) / 2.0).clamp(-1.0, 1.0).acos().to_degrees();
         let mean = barf.iter().map(angle).sum::<f64>() / 2000.0;
         assert!((mean - 13.7).abs() < 0.5, "{mean}");
-        let l2g = InitialPoses::l2g_of("ship").draw(views(&truth), 0).unwrap().noise.unwrap().1;
+        let l2g = InitialPoses::L2g { rotation: 0.09, translation: 0.7 };
+        let l2g = l2g.draw(views(&truth), 0).unwrap().noise.unwrap().1;
         let square = l2g.iter().map(|p| p.translation.norm_squared()).sum::<f64>() / 6000.0;
         assert!((square.sqrt() - 0.7).abs() < 0.03, "{square}");
-        assert_eq!(InitialPoses::l2g_of("mine"), InitialPoses::L2g { rotation: 0.03, translation: 0.3 });
+    }
+
+    #[test]
+    fn files_know_their_views() {
+        let truth = cameras(3);
+        let named = |names: [&'static str; 3], poses: &[Pose]| -> Vec<(&'static str, Option<Pose>)> {
+            names.into_iter().zip(poses.iter().map(|p| Some(*p))).collect()
+        };
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("initial_poses.json");
+        let start = InitialPoses::Identity.draw(views(&truth), 0).unwrap();
+        std::fs::write(&path, start.to_json(None, named(["a", "b", "c"], &truth))).unwrap();
+        let check = |views: Vec<(&str, Option<Pose>)>| PoseStart::check_views(&path, views).map_err(|e| e.to_string());
+        assert_eq!(check(named(["a", "b", "c"], &truth)), Ok(()));
+        assert_eq!(check(vec![("a", None), ("b", None), ("c", None)]), Ok(()));
+        let mut moved = truth.clone();
+        moved[1].translation.x += 1e-3;
+        for (views, expected) in [
+            (named(["a", "x", "c"], &truth), "view 2 `x` was `b`"),
+            (named(["a", "b", "c"], &moved), "view 2 `b` had another reference pose"),
+            (named(["a", "b", "c"], &truth)[..2].to_vec(), "`views` has 3 cameras, but the scene has 2"),
+        ] {
+            let error = check(views).unwrap_err();
+            assert!(error.contains(expected) && error.contains("initial_poses.json"), "{error}");
+        }
+        std::fs::write(&path, start.to_json(None, [])).unwrap();
+        assert_eq!(check(named(["a", "x", "c"], &truth)), Ok(()));
     }
 
     #[test]
@@ -249,7 +319,7 @@ mod tests {
         assert!(unknown.contains("a.png") && unknown.contains("identity"), "{unknown}");
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("poses.json");
-        let three = InitialPoses::Identity.draw(views(&cameras(3)), 0).unwrap().to_json(None);
+        let three = InitialPoses::Identity.draw(views(&cameras(3)), 0).unwrap().to_json(None, []);
         let skewed = r#"{"poses": [[1,0,0,0, 0,1,0,0, 0,0,1,0], [1,0.5,0,0, 0,1,0,0, 0,0,1,0]]}"#;
         for (text, expected) in [
             (three.as_str(), "`poses` has 3 cameras, but the scene has 2"),

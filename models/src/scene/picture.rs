@@ -87,7 +87,18 @@ pub(super) fn read_view(entry: &Entry, frame: &WorldFrame, options: &LoadOptions
     };
     let intrinsics = Intrinsics { distortion: None, ..native.resized(height, width) };
     let pose = entry.pose.as_ref().map(|p| frame.load(p));
-    Ok(View { name: entry.name.clone(), pixels, transparent, intrinsics, pose, mask, depth })
+    let removed_distortion = native.distortion.filter(|d| d.iter().any(|k| *k != 0.0));
+    Ok(View {
+        name: entry.name.clone(),
+        file: entry.image.clone(),
+        removed_distortion,
+        pixels,
+        transparent,
+        intrinsics,
+        pose,
+        mask,
+        depth,
+    })
 }
 
 fn bytes_of(channels: usize, image: &DynamicImage, data: Vec<u8>) -> Bytes {

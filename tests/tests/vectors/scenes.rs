@@ -145,7 +145,7 @@ fn fox_loads() {
     let scene = load(&folder, &small([160, 90]), &progress).unwrap();
     assert_eq!(heard.into_inner(), 67);
     sound(&scene, [160, 90], [58, 9, 9]);
-    assert!(scene.removed_distortion.is_some() && scene.train[0].intrinsics.distortion.is_none());
+    assert!(scene.train[0].removed_distortion.is_some() && scene.train[0].intrinsics.distortion.is_none());
     let center = |v: &View| v.pose.unwrap().center().norm();
     let mean = scene.train.iter().map(center).sum::<f64>() / 58.0;
     assert!((mean - 4.0).abs() < 0.2, "{mean}");

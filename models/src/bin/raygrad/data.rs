@@ -75,7 +75,7 @@ fn summary(scene: &Scene) -> String {
     let vary = if high - low > 1e-3 * high { format!("; fx from {low:.1} to {high:.1}") } else { String::new() };
     let numbers = format!("fx {:.2}, fy {:.2}, cx {:.2}, cy {:.2} px", c.fx, c.fy, c.cx, c.cy);
     line("intrinsics", format!("{numbers}, {angle:.1} degrees wide{vary}"));
-    if let Some([k1, k2, p1, p2]) = scene.removed_distortion {
+    if let Some([k1, k2, p1, p2]) = scene.train[0].removed_distortion {
         line("distortion", format!("k1 {k1}, k2 {k2}, p1 {p1}, p2 {p2}; removed on loading"));
     }
     line(

@@ -4,9 +4,10 @@ use crate::held::HeldRun;
 use crate::print;
 use crate::progress::bar;
 use crate::surface::{Surface, SurfaceArgs};
+use anyhow::bail;
 use clap::Args;
 use raygrad::Error;
-use raygrad::evaluation::{Evaluation, PublishedTable, Table, published_for};
+use raygrad::evaluation::{Evaluation, Measured, PublishedTable, Table, published_for};
 use raygrad::run::RunFolder;
 use raygrad::run::files::write_atomically;
 use raygrad::scene::Layout;
@@ -53,28 +54,36 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     if let Some(weights) = &args.lpips {
         experiment = experiment.lpips(weights)?;
     }
-    let reference = args.surface.reference()?;
+    let checked = args.surface.checked()?;
+    for path in [&args.csv, &args.latex].into_iter().flatten() {
+        let parent = path.parent().filter(|p| !p.as_os_str().is_empty());
+        if let Some(parent) = parent.filter(|p| !p.is_dir()) {
+            bail!("cannot write {}: there is no folder {}", path.display(), parent.display());
+        }
+    }
     let folder = RunFolder::open(&args.held.run).map_err(Error::from)?;
     let settings = experiment.layered.settings.clone();
+    let had_lpips =
+        std::fs::read_to_string(folder.path().join("evaluation.json")).is_ok_and(|t| t.contains("\"lpips\""));
     let (evaluation, step, surface, layout);
     if settings.scene.is_some() || args.surface.wanted() {
         let mut explorer = experiment.restored_explorer()?;
         evaluation = measure(&mut explorer, &folder)?;
         layout = Some(explorer.data.scene.layout);
         step = explorer.steps_done();
-        surface = match args.surface.wanted() {
-            true => Some(args.surface.run(&mut explorer, reference.as_ref())?),
-            false => None,
-        };
+        // Of what was measured something is told in any case.
+        surface = args.surface.wanted().then(|| args.surface.run(&mut explorer, &checked)).transpose();
     } else {
         let mut trainer = experiment.restored()?;
         evaluation = measure(&mut *trainer, &folder)?;
-        (step, surface, layout) = (trainer.steps_done(), None, None);
+        (step, surface, layout) = (trainer.steps_done(), Ok(None), None);
     }
     let dataset = layout.map_or("planar", Layout::name);
-    let (start, scene) = (settings.start_name(), evaluation.scene.as_str());
+    // As the run was asked to start: the experiment takes the copy that it keeps.
+    let start = RunFolder::settings_of_run(&args.held.run).map_err(Error::from)?.settings.start_name();
+    let scene = evaluation.scene.as_str();
     let published = published_for(dataset, start.as_deref(), &[scene], &[settings.method_name()]);
-    let title = format!("{}, step {step} of {}", args.held.run.display(), settings.optim.steps);
+    let title = format!("{}, step {step} of {}", args.held.run.display(), settings.optim.taken());
     let table = Table { title, evaluations: vec![evaluation], published };
     for (path, text) in [(&args.csv, table.views_csv()), (&args.latex, table.to_latex())] {
         if let Some(path) = path {
@@ -83,20 +92,27 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     }
     let evaluation = &table.evaluations[0];
     if args.json {
-        let (steps, published) = (settings.optim.steps, &table.published);
-        let json = serde_json::to_string(&Json { step, steps, evaluation, mesh: surface.as_ref(), published })?;
+        let (steps, published) = (settings.optim.taken(), &table.published);
+        let mesh = surface.as_ref().ok().and_then(Option::as_ref);
+        let json = serde_json::to_string(&Json { step, steps, evaluation, mesh, published })?;
         print(&format!("{json}\n"))?;
+        surface?;
         return Ok(ExitCode::SUCCESS);
+    }
+    let lacks = |m: &Option<Measured>| m.as_ref().is_some_and(|m| m.mean.psnr_db.is_some() && m.mean.lpips.is_none());
+    if had_lpips && lacks(&evaluation.before) {
+        eprintln!("note: evaluation.json had LPIPS, which is measured with `--lpips` only");
     }
     let mut text = table.to_text();
     if settings.scene.is_none() {
         let errors = evaluation.cameras.views.iter().filter_map(|v| v.scores.corner_error_px);
         text += &format!("patches (px)  {}\n", errors.map(|e| format!("{e:.3}")).collect::<Vec<_>>().join("  "));
     }
-    if let Some(surface) = &surface {
+    if let Ok(Some(surface)) = &surface {
         text += &args.surface.text(surface);
     }
     print(&text)?;
+    surface?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -51,7 +51,7 @@ impl Observer for Progress {
     }
 
     fn expected(&mut self, seconds: f64, device: &str) {
-        let text = format!("about {} on {device}", duration(seconds));
+        let text = format!("about {} of steps on {device}", duration(seconds));
         match &self.bar {
             Some(bar) => bar.println(text),
             None => eprintln!("{text}"),

@@ -72,12 +72,8 @@ impl SurfaceArgs {
         self.mesh.is_some() || self.cloud.is_some()
     }
 
-    /// The reference, read before anything is computed.
-    pub fn reference(&self) -> Result<Option<Mesh>, Error> {
-        Ok(self.cloud.as_deref().map(Mesh::read_ply).transpose()?)
-    }
-
-    pub fn run(&self, explorer: &mut Explorer, reference: Option<&Mesh>) -> anyhow::Result<Surface> {
+    /// The reference and the grid, looked at before anything is computed.
+    pub fn checked(&self) -> Result<(Option<Mesh>, MeshOptions), Error> {
         let (low, high) = match self.mesh_bounds[..] {
             [low, high] => ([low; 3], [high; 3]),
             [x0, x1, y0, y1, z0, z1] => ([x0, y0, z0], [x1, y1, z1]),
@@ -86,21 +82,29 @@ impl SurfaceArgs {
                     origin: raygrad::config::Origin::Option("--mesh-bounds".into()),
                     key: "mesh-bounds".into(),
                     message: format!("expected 2 or 6 numbers, found {}", self.mesh_bounds.len()),
-                })
-                .into());
+                }));
             }
         };
         let points_a_side = self.mesh_resolution.saturating_add(1);
         let options = MeshOptions { low, high, points: [points_a_side; 3], threshold: self.mesh_threshold };
+        options.check()?;
+        Ok((self.cloud.as_deref().map(Mesh::read_ply).transpose()?, options))
+    }
+
+    pub fn run(
+        &self,
+        explorer: &mut Explorer,
+        (reference, options): &(Option<Mesh>, MeshOptions),
+    ) -> Result<Surface, Error> {
         let shown = bar("meshing", "points");
-        let mesh = explorer.mesh(&options, &|done, all| shown.show(done, all));
+        let mesh = explorer.mesh(options, &|done, all| shown.show(done, all));
         shown.finish();
         let mesh = mesh?;
         if let Some(path) = &self.mesh {
-            mesh.write(path).map_err(Error::from)?;
+            mesh.write(path)?;
         }
         let limit = (explorer.data.scene.layout == Layout::Dtu).then_some(DTU_LIMIT);
-        let distances = reference.map(|reference| -> Result<Distances, Error> {
+        let distances = reference.as_ref().map(|reference| -> Result<Distances, Error> {
             let found = chamfer(&points(&mesh, 0)?, &points(reference, 1)?, limit)?;
             Ok(Distances { accuracy: found.accuracy, completeness: found.completeness, mean: found.mean() })
         });

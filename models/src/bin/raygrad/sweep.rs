@@ -54,12 +54,11 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<ExitCode> {
                 print(&format!("stopped; continue with the same command and `--out {} --resume`\n", folder.display()))?;
                 return Ok(ExitCode::from(130));
             }
-            // One run that fails, as by diverging, leaves the others to be done.
-            Err(error) if !error.is_bad_input() => {
+            // One run that fails, by diverging or for a damaged scene, leaves the others to be done.
+            Err(error) => {
                 eprintln!("{} failed: {error}", cell.name);
                 failed.push(cell.name.as_str());
             }
-            Err(error) => return Err(error.into()),
         }
     }
     output_folder(&folder)?;
