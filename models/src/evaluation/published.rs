@@ -11,7 +11,7 @@ pub struct PublishedTable {
     pub paper: String,
     /// Which table of it.
     pub table: String,
-    /// `blender`, `llff`, `dtu`, `iphone` or `planar`.
+    /// `planar`, or the name of the layout of its scenes: `blender`, `llff`, `dtu`, or `folder` (photos without poses).
     pub dataset: String,
     /// Poses at the start: `identity`, `noise 0.15`, `noise per scene` or `colmap`; in the plane, the perturbations' noise.
     pub start: String,

@@ -94,7 +94,15 @@ impl SpaceData {
         let (noise, seed) = (&settings.noise, settings.run.seed);
         let start = match (wanted.poses_in(scene.layout), noise.kind) {
             ("truth", _) => InitialPoses::Truth.draw(names(), seed)?,
-            ("identity", _) => InitialPoses::Identity.draw(names(), seed)?,
+            ("identity", _) => {
+                let mut start = InitialPoses::Identity.draw(names(), seed)?;
+                // On DTU, as the INN paper does it, from where the cameras are on average.
+                if let (Layout::Dtu, Some(truth)) = (scene.layout, &truth) {
+                    let mean = truth.iter().map(Pose::center).sum::<nalgebra::Vector3<f64>>() / truth.len() as f64;
+                    start.poses.iter_mut().for_each(|p| p.translation = -mean);
+                }
+                start
+            }
             ("noisy", NoiseKind::Barf) => InitialPoses::Barf { deviation: noise.rotation }.draw(names(), seed)?,
             ("noisy", NoiseKind::L2g) => {
                 InitialPoses::L2g { rotation: noise.rotation, translation: noise.translation }.draw(names(), seed)?
