@@ -63,13 +63,14 @@ fn halves() -> [Half; 3] {
     [Half { matrices: None }, matrices(16, 32), matrices(8, 8)]
 }
 
-/// Tiles are made for matrices of 8 and 16, and for subgroups of which a workgroup holds at least four.
+/// Tiles are made for matrices of 8 and 16, and for subgroups of which a workgroup holds at least four; of matrices of 8 it would
+/// hold 16.
 #[test]
 fn matrices_that_no_tile_is_made_for_are_not_used() {
-    for (side, subgroup) in [(8, 4), (8, 8), (16, 32), (16, 64)] {
+    for (side, subgroup) in [(8, 4), (8, 8), (8, 16), (16, 32), (16, 64)] {
         assert_eq!(Matrices::new(side, subgroup), Some(Matrices { side, subgroup }));
     }
-    for (side, subgroup) in [(4, 32), (32, 32), (16, 128), (8, 2), (16, 48), (16, 0)] {
+    for (side, subgroup) in [(4, 32), (32, 32), (16, 128), (8, 2), (8, 32), (8, 64), (16, 48), (16, 0)] {
         assert_eq!(Matrices::new(side, subgroup), None, "{side}, {subgroup}");
     }
 }
@@ -88,13 +89,11 @@ fn kernels_in_half_precision_keep_to_the_limits() {
                 assert!(kernel.spirv().is_ok_and(|words| words.len() > 5), "{what}");
                 assert!(kernel.workgroup_size <= 256, "{what}");
                 multiply += usize::from(wgsl.contains("coopMultiplyAdd"));
-                // The smallest tile of matrices needs 24 KiB.
-                let most =
-                    if half.matrices.is_some() { max_workgroup_bytes.max(24 << 10) } else { max_workgroup_bytes };
-                assert!(kernel.workgroup_bytes() <= most, "{what}: {} bytes", kernel.workgroup_bytes());
+                assert!(kernel.workgroup_bytes() <= max_workgroup_bytes, "{what}: {} bytes", kernel.workgroup_bytes());
             }
-            // Two layers forwards, two backwards, and two gradients of weights.
-            assert_eq!(multiply, if half.matrices.is_some() { 6 } else { 0 }, "{half:?}");
+            // Two layers forwards, two backwards, and two gradients of weights. No tile of matrices fits into 16 KiB.
+            let fit = half.matrices.is_some() && max_workgroup_bytes > 16 << 10;
+            assert_eq!(multiply, if fit { 6 } else { 0 }, "{half:?}");
         }
     }
 }

@@ -10,6 +10,9 @@ use {
     raygrad_kernels::gpu::{Half, SOFTWARE_TILES, storages},
 };
 
+/// Threads of the CPU that can be asked for.
+const MOST_THREADS: usize = 1024;
+
 /// A device to run sessions on.
 #[derive(Clone)]
 pub enum Device {
@@ -126,6 +129,10 @@ impl Device {
     pub fn cpu(threads: Option<usize>) -> Result<Device, DeviceError> {
         let threads = match threads {
             Some(0) => return Err(DeviceError::Threads { threads: 0, reason: "at least one is needed".into() }),
+            Some(n) if n > MOST_THREADS => {
+                let reason = format!("at most {MOST_THREADS} are of any use");
+                return Err(DeviceError::Threads { threads: n, reason });
+            }
             Some(n) => n,
             None => std::thread::available_parallelism().map_or(1, usize::from),
         };

@@ -1,6 +1,7 @@
 //! What can go wrong with devices and runs.
 
 use raygrad_compiler::graph::Shape;
+use raygrad_compiler::ops::input::Role;
 
 /// A device that cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -32,10 +33,18 @@ pub enum RunError {
     Type { name: String, shape: Shape, found: &'static str },
     #[error("input `{name}` is {first} in one program of the session and {second} in another")]
     Conflict { name: String, first: Shape, second: Shape },
+    #[error(
+        "input `{name}` is {first:?} in one program of the session and {second:?} in another: the host sets a PerStep input before every step"
+    )]
+    Roles { name: String, first: Role, second: Role },
     #[error("the program was compiled for {0:?}, which this device does not run")]
     Target(raygrad_compiler::fuse::TargetKind),
     #[error("{device}: `{buffer}` has {bytes} bytes, the device binds at most {limit} at once")]
     TooLarge { device: String, buffer: String, bytes: u64, limit: u64 },
+    #[error("no memory for {what}, {bytes} bytes")]
+    Memory { what: String, bytes: u64 },
+    #[error("the program belongs to another session")]
+    OtherSession,
     #[error("{device}: {problem}")]
     Device { device: String, problem: String },
 }

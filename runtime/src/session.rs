@@ -12,6 +12,7 @@ use raygrad_compiler::scalar::DType;
 use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 /// What a backend does. Lanes are in buffer order: channel by channel, each over all elements.
 pub(crate) trait Executor: Send {
@@ -30,7 +31,10 @@ pub(crate) trait Executor: Send {
 
 /// A program loaded into a session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub struct ProgramId(usize);
+pub struct ProgramId {
+    session: u64,
+    number: usize,
+}
 
 /// An input of a session.
 #[derive(Clone, Debug)]
@@ -41,6 +45,8 @@ pub struct InputInfo {
 
 /// Programs on a device and the inputs they share.
 pub struct Session {
+    /// No other session of this process has it.
+    id: u64,
     executor: Box<dyn Executor>,
     programs: Vec<Arc<Program>>,
     inputs: BTreeMap<String, InputInfo>,
@@ -56,24 +62,31 @@ impl Session {
             #[cfg(feature = "vulkan")]
             Device::Vulkan { gpu, forms } => Box::new(GpuExecutor::new(crate::vulkan::VulkanApi::new(gpu)?, forms)),
         };
-        Ok(Session { executor, programs: vec![], inputs: BTreeMap::new() })
+        static SESSIONS: AtomicU64 = AtomicU64::new(0);
+        let id = SESSIONS.fetch_add(1, Ordering::Relaxed);
+        Ok(Session { id, executor, programs: vec![], inputs: BTreeMap::new() })
     }
 
-    /// Loads a program. All inputs it does not share with earlier programs start as zeros.
+    /// Loads a program. All inputs it does not share with earlier programs start as zeros. If it fails, the session is as before.
     pub fn add(&mut self, program: Program) -> Result<ProgramId, RunError> {
+        let mut inputs = self.inputs.clone();
         for (name, role, shape) in program.inputs() {
-            match self.inputs.get(name) {
+            match inputs.get(name) {
                 Some(known) if !same_layout(&known.shape, shape) => {
                     let (first, second) = (known.shape.clone(), shape.clone());
                     return Err(RunError::Conflict { name: name.into(), first, second });
                 }
-                _ => self.inputs.insert(name.into(), InputInfo { role, shape: shape.clone() }),
+                Some(known) if (known.role == Role::PerStep) != (role == Role::PerStep) => {
+                    return Err(RunError::Roles { name: name.into(), first: known.role, second: role });
+                }
+                _ => inputs.insert(name.into(), InputInfo { role, shape: shape.clone() }),
             };
         }
         let program = Arc::new(program);
-        let id = self.executor.add(program.clone())?;
+        let number = self.executor.add(program.clone())?;
+        self.inputs = inputs;
         self.programs.push(program);
-        Ok(ProgramId(id))
+        Ok(ProgramId { session: self.id, number })
     }
 
     /// Inputs by name.
@@ -134,13 +147,15 @@ impl Session {
 
     /// Runs a program once. On a GPU this only submits.
     pub fn run(&mut self, program: ProgramId) -> Result<(), RunError> {
-        self.executor.run(program.0)
+        let number = self.own(program)?;
+        self.executor.run(number)
     }
 
     /// Runs a program once, by the device's clock: seconds of each of its launches. `None` where the device has no clock;
     /// then nothing ran. Waits for the device.
     pub fn profile(&mut self, program: ProgramId) -> Result<Option<Vec<f64>>, RunError> {
-        self.executor.profile(program.0)
+        let number = self.own(program)?;
+        self.executor.profile(number)
     }
 
     /// A float output of the program's last run, in host order; waits for the device.
@@ -150,17 +165,26 @@ impl Session {
 
     /// The lanes of any output, in host order; waits for the device.
     pub fn read_lanes(&mut self, program: ProgramId, output: &str) -> Result<Vec<u32>, RunError> {
-        let plan = &self.programs[program.0];
+        let number = self.own(program)?;
+        let plan = &self.programs[number];
         let found = plan.outputs.iter().find(|(name, _)| name == output);
         let (_, buffer) = found.ok_or_else(|| RunError::UnknownOutput(output.into()))?;
         let shape = plan.buffer(*buffer).shape.clone();
-        let lanes = self.executor.output(program.0, *buffer)?;
+        let lanes = self.executor.output(number, *buffer)?;
         Ok(to_host(lanes, &shape))
     }
 
     /// A loaded program.
+    ///
+    /// # Panics
+    /// Maybe, if it belongs to another session.
     pub fn program(&self, id: ProgramId) -> &Program {
-        &self.programs[id.0]
+        &self.programs[id.number]
+    }
+
+    /// The number of a program, if it is this session's.
+    fn own(&self, program: ProgramId) -> Result<usize, RunError> {
+        if program.session == self.id { Ok(program.number) } else { Err(RunError::OtherSession) }
     }
 }
 

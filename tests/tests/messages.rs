@@ -59,6 +59,20 @@ fn running() {
     note("an output that the program lacks", session.read(id, "z").map(drop));
     note("a program of another size", session.add(program(9, Target::cpu())).map(drop));
     note("a program for a GPU", session.add(program(8, Target::gpu())).map(drop));
-    all.push(("no threads".into(), Device::cpu(Some(0)).err().expect("refused").to_string()));
+    let n = Tensor::data("n", Shape::new(&[], 1).with_dtype(DType::U32));
+    let once = Step { outputs: vec![("y".into(), n.to_f32())], updates: vec![] };
+    note(
+        "an input set once, which was one of every step",
+        session.add(compile(&once, &Target::cpu()).expect("compiles")).map(drop),
+    );
+    let mut other = Session::new(Device::cpu(Some(1)).expect("starts a thread")).expect("opens");
+    note("a program too large", other.add(program(1 << 45, Target::cpu())).map(drop));
+    note("its input", other.set("x", &[1.0]));
+    other.add(program(9, Target::cpu())).expect("loads");
+    note("a program of another session", other.run(id));
+    note("an output of a program of another session", other.read(id, "y").map(drop));
+    for (what, threads) in [("no threads", 0), ("threads for thousands of cores", 1025)] {
+        all.push((what.into(), Device::cpu(Some(threads)).err().expect("refused").to_string()));
+    }
     snapshot("messages-running", &all);
 }

@@ -27,16 +27,22 @@ unsafe impl Sync for AlignedVec {}
 impl AlignedVec {
     /// A buffer of `len` zeros.
     pub fn zeroed(len: usize) -> AlignedVec {
+        AlignedVec::try_zeroed(len).unwrap_or_else(|| match Self::layout(len) {
+            Some(layout) => handle_alloc_error(layout),
+            None => panic!("buffer size overflows"),
+        })
+    }
+
+    /// The same; `None` if there is no memory for it.
+    pub fn try_zeroed(len: usize) -> Option<AlignedVec> {
         if len == 0 {
-            return AlignedVec { base: NonNull::dangling(), ptr: NonNull::dangling(), len };
+            return Some(AlignedVec { base: NonNull::dangling(), ptr: NonNull::dangling(), len });
         }
-        let layout = Self::layout(len);
-        // SAFETY: `layout` has a nonzero size because `len > 0`.
-        let raw = unsafe { alloc_zeroed(layout) };
-        let Some(base) = NonNull::new(raw) else { handle_alloc_error(layout) };
+        // SAFETY: the layout has a nonzero size because `len > 0`.
+        let base = NonNull::new(unsafe { alloc_zeroed(Self::layout(len)?) })?;
         // SAFETY: less than `ALIGN` bytes on, of which the allocation has so many more than `len` floats.
         let ptr = unsafe { base.add(base.addr().get().next_multiple_of(ALIGN) - base.addr().get()) };
-        AlignedVec { base, ptr: ptr.cast(), len }
+        Some(AlignedVec { base, ptr: ptr.cast(), len })
     }
 
     /// Grows to at least `len` elements; keeps the old contents, new elements are zero.
@@ -56,19 +62,20 @@ impl AlignedVec {
         self.ptr.as_ptr()
     }
 
-    /// Room for `len` floats at an aligned address.
-    fn layout(len: usize) -> Layout {
-        let bytes = len.checked_mul(size_of::<f32>()).and_then(|b| b.checked_add(ALIGN));
-        Layout::from_size_align(bytes.expect("buffer size overflows"), align_of::<f32>())
-            .expect("buffer size overflows")
+    /// Room for `len` floats at an aligned address, unless it is larger than any memory.
+    fn layout(len: usize) -> Option<Layout> {
+        let bytes = len.checked_mul(size_of::<f32>())?.checked_add(ALIGN)?;
+        Layout::from_size_align(bytes, align_of::<f32>()).ok()
     }
 }
 
 impl Drop for AlignedVec {
     fn drop(&mut self) {
-        if self.len > 0 {
+        if self.len > 0
+            && let Some(layout) = Self::layout(self.len)
+        {
             // SAFETY: `len > 0`, so `base` came from `alloc_zeroed` with this very layout and is freed only here.
-            unsafe { dealloc(self.base.as_ptr(), Self::layout(self.len)) }
+            unsafe { dealloc(self.base.as_ptr(), layout) }
         }
     }
 }
@@ -125,5 +132,8 @@ mod tests {
         v.grow(3);
         assert_eq!(v.clone().len(), 1000);
         assert!(AlignedVec::default().is_empty());
+        for too_many in [1 << 58, usize::MAX / 4, usize::MAX] {
+            assert!(AlignedVec::try_zeroed(too_many).is_none());
+        }
     }
 }

@@ -242,6 +242,42 @@ fn outer_matches_f64_and_agrees_where_multiply_adds_are_fused() {
     }
 }
 
+/// Vectors that hold the last channels are whole: beyond them they repeat the last one, and nothing that was never written.
+#[test]
+fn the_rest_of_a_vector_repeats_the_last_channel() {
+    for form in forms().into_iter().filter(|f| *f != (Isa::AmxBf16, Products::Bf16)) {
+        for n in [1, 7, 9, 17, 24, 31] {
+            let (k, rows) = (70, 96);
+            let ld = row_stride(rows);
+            let (mut x, mut d) = (noise(k * ld, 5), noise(n * ld, 6));
+            let mut g = AlignedVec::zeroed(outer_len(k, n));
+            let mut scratch = AlignedVec::zeroed(outer_scratch(form.1, k, n, rows));
+            assert!(!outer::x_along_vectors(k, n));
+            let args = Outer {
+                x: x.as_mut_ptr(),
+                ldx: ld,
+                k,
+                first: 0,
+                channels: k,
+                d: d.as_mut_ptr(),
+                ldd: ld,
+                n,
+                rows,
+                products: form.1,
+                scratch: scratch.as_mut_ptr(),
+                g: g.as_mut_ptr(),
+            };
+            // SAFETY: the form is available, and the buffers have the shapes given.
+            unsafe { outer(form.0, args) };
+            for line in g.chunks_exact(outer::PANEL) {
+                // What no vector reaches is as it was.
+                let end = line.iter().rposition(|v| *v != 0.0).map_or(0, |last| last + 1);
+                assert!(end >= n && line[n..end].iter().all(|v| *v == line[n - 1]), "{form:?}, {n}: {line:?}");
+            }
+        }
+    }
+}
+
 #[test]
 fn kernels_repeat_bitwise() {
     for form in forms() {

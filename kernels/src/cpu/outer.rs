@@ -129,7 +129,7 @@ impl Outer {
     /// As [`outer`].
     #[inline(always)]
     unsafe fn run_with<S: Simd, P: Multiply<S>>(&self) {
-        // SAFETY: forwarded contract. `NV * LANES` divides `PANEL`.
+        // SAFETY: forwarded contract. `NV` is twice `HALF`, and `NV * LANES` divides `PANEL`.
         unsafe {
             match S::REGISTERS {
                 32.. => self.panels::<S, P, 8, 2, 1, false>(),
@@ -143,7 +143,7 @@ impl Outer {
     /// (see [`super::amx`]).
     ///
     /// # Safety
-    /// As [`outer`], and `NV * S::LANES` divides [`PANEL`].
+    /// As [`outer`], `NV` is twice `HALF`, and `NV * S::LANES` divides [`PANEL`].
     #[inline(always)]
     pub(super) unsafe fn panels<
         S: Simd,
@@ -182,10 +182,11 @@ impl Outer {
             while channel < vectors.count {
                 let count = PANEL.min(vectors.count - channel);
                 // SAFETY: `count` channels from `channel` on and `rows` rows from `row` on lie inside the operand, and
-                // the panel has room for them. Panel `channel / PANEL` of `g` has `height` lines of `PANEL` floats.
+                // the panel has room for them, up to whole vectors: all those that are multiplied. Panel `channel / PANEL` of `g` has `height` lines of `PANEL` floats.
                 unsafe {
                     let from = Channels { at: vectors.at.add(channel * vectors.ld + row), count, ..vectors };
-                    transpose::<S>(P::over_rows(from, rows, strip), steps, panel);
+                    let width = count.next_multiple_of(HALF * S::LANES);
+                    transpose::<S>(P::over_rows(from, rows, strip), width, steps, panel);
                     let g = self.g.add(first + channel * height);
                     match IN_TILES {
                         #[cfg(target_arch = "x86_64")]
@@ -200,14 +201,15 @@ impl Outer {
     }
 }
 
-/// Writes `rows` lanes of up to [`PANEL`] channels to `panel`, in whole vectors; channels beyond the last one repeat it.
+/// Writes `rows` lanes of `width` channels to `panel`; channels beyond the last one repeat it.
 ///
 /// # Safety
-/// As [`outer`]: the channels have `rows` rows, and `panel` has room for as many lines of [`PANEL`] floats.
+/// As [`outer`]: the channels have `rows` rows, and `panel` has room for as many lines of [`PANEL`] floats. `width` is at most
+/// [`PANEL`], in whole vectors.
 #[inline(always)]
-unsafe fn transpose<S: Simd>(from: Channels, rows: usize, panel: *mut f32) {
+unsafe fn transpose<S: Simd>(from: Channels, width: usize, rows: usize, panel: *mut f32) {
     let mut channel = 0;
-    while channel < from.count {
+    while channel < width {
         let mut at = [from.at; 16];
         for (i, at) in at.iter_mut().enumerate() {
             *at = from.at.wrapping_add((channel + i).min(from.count - 1) * from.ld);
@@ -225,7 +227,8 @@ unsafe fn transpose<S: Simd>(from: Channels, rows: usize, panel: *mut f32) {
 /// All sums of a panel: the first `count` of its columns by all of `others`.
 ///
 /// # Safety
-/// As [`Outer::panels`]: `g` has a line of the panel for each of `others`.
+/// As [`Outer::panels`]: `g` has a line of the panel for each of `others`. Up to the next multiple of `HALF` vectors, the panel's
+/// columns are written.
 #[inline(always)]
 unsafe fn columns<S: Simd, P: Multiply<S>, const MR: usize, const NV: usize, const HALF: usize>(
     panel: *const f32,

@@ -1,5 +1,6 @@
 //! Half precision: what a device has for it, and what is stored in it.
 
+use super::tile::Tile;
 use raygrad_compiler::graph::Shape;
 use raygrad_compiler::plan::region::{Inst, InstId, Region, RegionOp, Store};
 use raygrad_compiler::plan::{Buffer, BufferKind, Program};
@@ -30,10 +31,12 @@ pub struct Matrices {
 }
 
 impl Matrices {
-    /// If tiles are made for subgroups of so many invocations: a workgroup needs at least four.
+    /// If tiles are made for subgroups of so many invocations: a workgroup needs at least four, and each has something of two
+    /// matrices, so that matrices of 8 suit no more than 32. The smallest tile must start, which they do up to 16.
     pub fn new(side: u32, subgroup: u32) -> Option<Matrices> {
-        ([8, 16].contains(&side) && (4..=64).contains(&subgroup) && subgroup.is_power_of_two())
-            .then_some(Matrices { side, subgroup })
+        let sizes = Matrices { side, subgroup };
+        let known = [8, 16].contains(&side) && (4..=64).contains(&subgroup) && subgroup.is_power_of_two();
+        (known && 2 * subgroup <= side * side && Tile::smallest(sizes).starts()).then_some(sizes)
     }
 }
 

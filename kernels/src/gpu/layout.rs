@@ -6,6 +6,7 @@
 
 use super::LowerError;
 use super::half::{Half, Matrices, Storage, may_be_half, storages};
+use super::tile::Tile;
 use raygrad_compiler::cost::Rates;
 use raygrad_compiler::graph::Shape;
 use raygrad_compiler::ops::input::Role;
@@ -62,9 +63,10 @@ impl Limits {
         256 * self.workgroups as usize
     }
 
-    /// Cooperative matrices for tiles; those of drivers in software have none.
+    /// Cooperative matrices for tiles, if the smallest fits; those of drivers in software have none.
     pub(super) fn matrices(&self) -> Option<Matrices> {
-        self.half.and_then(|h| h.matrices).filter(|_| self.tiles != SOFTWARE_TILES)
+        let used = |m: &Matrices| self.tiles != SOFTWARE_TILES && Tile::smallest(*m).fits(self);
+        self.half.and_then(|h| h.matrices).filter(used)
     }
 }
 

@@ -48,11 +48,10 @@ impl Tile {
             let each = (workgroups as f64 / f64::from(limits.workgroups)).max(1.0);
             (t, each * f64::from(t.m * t.n) / rate)
         };
-        let fits = |t: &Tile| t.bytes() <= limits.max_workgroup_bytes && t.invocations() <= MOST_INVOCATIONS;
         let all = Tile::candidates(limits, (m, n, k));
-        // The last one fits in any case.
+        // The last one fits in any case: of matrices, see [`Limits::matrices`].
         let (last, larger) = (all[all.len() - 1], &all[..all.len() - 1]);
-        let others = larger.iter().skip(limits.tiles as usize).filter(|(t, _)| fits(t));
+        let others = larger.iter().skip(limits.tiles as usize).filter(|(t, _)| t.fits(limits));
         others.chain([&last]).map(|t| time(*t)).min_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or(time(last))
     }
 
@@ -65,13 +64,8 @@ impl Tile {
             && n > 32
             && k >= 16
         {
-            // Blocks of a subgroup, in matrices.
-            let side = matrices.side;
-            let tile = |m, n, (own_m, own_n): (u32, u32)| {
-                let (own_m, own_n) = (own_m * side, own_n * side);
-                Tile { m, n, k: 32, own_m, own_n, matrices: Some(matrices), direct: false }
-            };
-            let smallest = (tile(64, 64, (2, 2)), 0.5);
+            let tile = |m, n, own| Tile::of_matrices(matrices, m, n, own);
+            let smallest = (Tile::smallest(matrices), 0.5);
             return match n {
                 0..=64 => vec![(tile(128, 64, (4, 2)), 0.8), smallest],
                 65..=128 => vec![(tile(256, 128, (4, 4)), 1.0), (tile(64, 128, (2, 4)), 0.8), smallest],
@@ -101,6 +95,27 @@ impl Tile {
                 vec![largest, (tile(64, 64, deep, 8, 8), 0.84), (tile(32, 32, deep, 4, 4), 0.5)]
             }
         }
+    }
+
+    /// The smallest tile of matrices, which must fit where they are used.
+    pub fn smallest(matrices: Matrices) -> Tile {
+        Tile::of_matrices(matrices, 64, 64, (2, 2))
+    }
+
+    /// A tile of matrices, with the block of a subgroup in matrices.
+    fn of_matrices(matrices: Matrices, m: u32, n: u32, own: (u32, u32)) -> Tile {
+        let (own_m, own_n) = (own.0 * matrices.side, own.1 * matrices.side);
+        Tile { m, n, k: 32, own_m, own_n, matrices: Some(matrices), direct: false }
+    }
+
+    /// Whether a device can start its workgroups.
+    pub fn fits(&self, limits: &Limits) -> bool {
+        self.bytes() <= limits.max_workgroup_bytes && self.starts()
+    }
+
+    /// Whether a workgroup has no more invocations than any device starts.
+    pub fn starts(&self) -> bool {
+        self.invocations() <= MOST_INVOCATIONS
     }
 
     /// A tile for drivers in software.

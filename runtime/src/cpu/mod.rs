@@ -58,14 +58,19 @@ impl CpuExecutor {
         CpuExecutor { pool, isa: Isa::detect(), products, memory: vec![], inputs: HashMap::new(), programs: vec![] }
     }
 
-    fn allocate(&mut self, lanes: usize) -> usize {
-        self.memory.push(AlignedVec::zeroed(lanes));
-        self.memory.len() - 1
+    fn allocate(&mut self, what: &str, lanes: usize) -> Result<usize, RunError> {
+        self.memory.push(zeroed(what, lanes)?);
+        Ok(self.memory.len() - 1)
     }
 
     fn input(&self, name: &str) -> Result<(usize, usize), RunError> {
         self.inputs.get(name).copied().ok_or_else(|| RunError::UnknownInput(name.into()))
     }
+}
+
+fn zeroed(what: &str, lanes: usize) -> Result<AlignedVec, RunError> {
+    let too_large = || RunError::Memory { what: what.into(), bytes: (lanes as u64).saturating_mul(4) };
+    AlignedVec::try_zeroed(lanes).ok_or_else(too_large)
 }
 
 fn lower_launch(program: &Program, index: usize, products: Products) -> Launch {
@@ -78,36 +83,12 @@ impl Executor for CpuExecutor {
         if program.target.kind != TargetKind::Cpu {
             return Err(RunError::Target(program.target.kind));
         }
-        let slots: Vec<usize> = program.slots.iter().map(|lanes| self.allocate(*lanes)).collect();
-        let mut places = vec![];
-        for buffer in &program.buffers {
-            let lanes = buffer.shape.lanes();
-            places.push(match &buffer.kind {
-                BufferKind::Temporary { slot } => slots[*slot],
-                BufferKind::Output => self.allocate(lanes),
-                BufferKind::Input { name, .. } => match self.inputs.get(name) {
-                    Some((place, _)) => *place,
-                    None => {
-                        let place = self.allocate(lanes);
-                        self.inputs.insert(name.clone(), (place, lanes));
-                        place
-                    }
-                },
-            });
-        }
-        let launches: Vec<Launch> =
-            (0..program.launches.len()).map(|i| lower_launch(&program, i, self.products)).collect();
-        let tiles = || launches.iter().filter_map(|l| l.tiles.as_ref());
-        let packed = tiles().map(|t| t.packed).max().unwrap_or(0);
-        let accumulators = tiles().map(|t| t.accumulated * t.chunks).max().unwrap_or(0);
-        let lanes = program.buffers.iter().map(|b| b.shape.lanes()).collect();
-        self.programs.push(Loaded {
-            launches,
-            places,
-            lanes,
-            packed: AlignedVec::zeroed(packed),
-            accumulators: AlignedVec::zeroed(accumulators),
-        });
+        let before = self.memory.len();
+        let loaded = self.load(&program);
+        self.programs.push(loaded.inspect_err(|_| {
+            self.memory.truncate(before);
+            self.inputs.retain(|_, (place, _)| *place < before);
+        })?);
         Ok(self.programs.len() - 1)
     }
 
@@ -145,6 +126,36 @@ impl Executor for CpuExecutor {
 }
 
 impl CpuExecutor {
+    /// A program with memory for its buffers; inputs that earlier programs have stay where they are.
+    fn load(&mut self, program: &Program) -> Result<Loaded, RunError> {
+        let slots = program.slots.iter().map(|lanes| self.allocate("temporary values", *lanes));
+        let slots: Vec<usize> = slots.collect::<Result<_, _>>()?;
+        let mut places = vec![];
+        for buffer in &program.buffers {
+            let lanes = buffer.shape.lanes();
+            places.push(match &buffer.kind {
+                BufferKind::Temporary { slot } => slots[*slot],
+                BufferKind::Output => self.allocate(&format!("output `{}`", buffer.label), lanes)?,
+                BufferKind::Input { name, .. } => match self.inputs.get(name) {
+                    Some((place, _)) => *place,
+                    None => {
+                        let place = self.allocate(&format!("input `{name}`"), lanes)?;
+                        self.inputs.insert(name.clone(), (place, lanes));
+                        place
+                    }
+                },
+            });
+        }
+        let launches: Vec<Launch> =
+            (0..program.launches.len()).map(|i| lower_launch(program, i, self.products)).collect();
+        let tiles = || launches.iter().filter_map(|l| l.tiles.as_ref());
+        let packed = tiles().map(|t| t.packed).max().unwrap_or(0);
+        let accumulators = tiles().map(|t| t.accumulated * t.chunks).max().unwrap_or(0);
+        let lanes = program.buffers.iter().map(|b| b.shape.lanes()).collect();
+        let (packed, accumulators) = (zeroed("packed weights", packed)?, zeroed("sums of chunks", accumulators)?);
+        Ok(Loaded { launches, places, lanes, packed, accumulators })
+    }
+
     /// Runs all launches; `done` is called after each.
     fn run_each(&mut self, program: usize, mut done: impl FnMut() + Send) {
         let loaded = &mut self.programs[program];
@@ -221,8 +232,10 @@ fn run_launch(
     }
     let packed = &packed[..tiles.packed];
     let run = |c: usize, own: &mut [f32]| {
-        for a in &tiles.accumulators {
-            own[a.at..a.at + a.len].fill(if a.kind == Reduction::Sum { 0.0 } else { f32::NEG_INFINITY });
+        if tiles.accumulated > 0 {
+            for a in &tiles.accumulators {
+                own[a.at..a.at + a.len].fill(if a.kind == Reduction::Sum { 0.0 } else { f32::NEG_INFINITY });
+            }
         }
         with_scratch(tiles.scratch, |scratch| {
             let mut chunk = Chunk { memory, isa, packed, scratch, accumulators: own };
@@ -246,9 +259,7 @@ fn run_launch(
     } else {
         own.collect::<Vec<_>>().into_par_iter().for_each(|(c, own)| run(c, own));
     }
-    if !tiles.direct {
-        combine(tiles, all, memory, lanes);
-    }
+    combine(tiles, all, memory, lanes);
 }
 
 /// Combines the chunks' accumulators pairwise, in an order that depends on their number alone, and stores the result.
@@ -314,5 +325,29 @@ impl Columns {
         let start = chunk * self.stride + at + range.start;
         // SAFETY: as the caller promises.
         unsafe { std::slice::from_raw_parts_mut(self.base.add(start), range.len()) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use raygrad_compiler::{Axis, Shape, Step, Target, Tensor, compile};
+
+    /// Totals of many lines go straight to their buffer: no chunk has a copy of it.
+    #[test]
+    fn totals_of_lines_take_no_memory_of_their_own() {
+        let (frame, row) = (Axis::new("frame", 5000), Axis::new("row", 8));
+        let x = Tensor::data("x", Shape::new(&[&frame, &row], 1));
+        let step = Step { outputs: vec![("sum".into(), x.exp().sum(&[&row]))], updates: vec![] };
+        let program = Arc::new(compile(&step, &Target::cpu()).unwrap());
+        let pool = Arc::new(rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap());
+        let mut executor = CpuExecutor::new(pool, Products::F32);
+        let id = executor.add(program.clone()).unwrap();
+        let loaded = &executor.programs[id];
+        assert!(loaded.launches.iter().any(|l| l.tiles.as_ref().is_some_and(|t| t.direct)), "{program}");
+        assert_eq!(loaded.accumulators.len(), 0);
+        executor.run(id).unwrap();
+        let sums = executor.output(id, program.outputs[0].1).unwrap();
+        assert!(sums.len() == 5000 && sums.iter().all(|s| f32::from_bits(*s) == 8.0));
     }
 }

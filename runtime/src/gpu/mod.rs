@@ -14,7 +14,9 @@ use raygrad_compiler::Program;
 use raygrad_compiler::fuse::TargetKind;
 use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::plan::region::BufferId;
-use raygrad_kernels::gpu::{Arena, ArenaId, GpuLaunch, Half, Inputs, Limits, LowerError, Part, Place, lower};
+use raygrad_kernels::gpu::{
+    Arena, ArenaId, GpuLaunch, GpuProgram, Half, Inputs, Limits, LowerError, Part, Place, lower,
+};
 use std::collections::BTreeMap;
 use std::fmt;
 use std::ops::Range;
@@ -22,6 +24,9 @@ use std::sync::Arc;
 
 /// Steps that may be queued before the host waits for the oldest.
 pub(crate) const QUEUED: usize = 4;
+
+/// Most lanes that are read at a time, through memory that a session keeps: 32 MiB.
+const READ: usize = 8 << 20;
 
 /// What an API for GPUs does. Writes, submissions and reads take effect in the order of the calls.
 pub(crate) trait Api: Send {
@@ -160,6 +165,16 @@ impl<A: Api> GpuExecutor<A> {
         Ok((&found.0, found.1.lanes()))
     }
 
+    /// Puts a program on the device, with the arenas of inputs that no earlier one has.
+    fn load(&mut self, program: GpuProgram, inputs: &[Arena]) -> Result<OnDevice<A>, RunError> {
+        for arena in inputs {
+            self.arenas.push(self.api.buffer(arena)?);
+        }
+        let arenas = program.arenas.iter().map(|a| self.api.buffer(a)).collect::<Result<Vec<_>, _>>()?;
+        let loaded = self.api.load(program.launches, &self.arenas, &arenas)?;
+        Ok(OnDevice { loaded, arenas, places: program.places })
+    }
+
     /// Writes what the host changed of the per-step inputs.
     fn flush(&mut self) -> Result<(), RunError> {
         for (arena, mirror) in &mut self.mirrors {
@@ -179,10 +194,12 @@ impl<A: Api> Executor for GpuExecutor<A> {
         let Forms { half, tiles, .. } = self.forms;
         let workgroups = program.target.rates.workgroups;
         let limits = Limits { half, tiles, workgroups, ..self.api.limits() };
-        let lowered = lower(&program, &mut self.inputs, &limits).map_err(|e| self.lower_error(e))?;
-        for arena in &self.inputs.arenas[self.arenas.len()..] {
-            self.arenas.push(self.api.buffer(arena)?);
-        }
+        let mut inputs = self.inputs.clone();
+        let lowered = lower(&program, &mut inputs, &limits).map_err(|e| self.lower_error(e))?;
+        let before = self.arenas.len();
+        let loaded = self.load(lowered, &inputs.arenas[before..]);
+        self.programs.push(loaded.inspect_err(|_| self.arenas.truncate(before))?);
+        self.inputs = inputs;
         for (name, role, _) in program.inputs() {
             if role == Role::PerStep {
                 let place = self.input(name)?.0.clone();
@@ -192,9 +209,6 @@ impl<A: Api> Executor for GpuExecutor<A> {
                 }
             }
         }
-        let arenas = lowered.arenas.iter().map(|a| self.api.buffer(a)).collect::<Result<Vec<_>, _>>()?;
-        let loaded = self.api.load(lowered.launches, &self.arenas, &arenas)?;
-        self.programs.push(OnDevice { loaded, arenas, places: lowered.places });
         Ok(self.programs.len() - 1)
     }
 
@@ -254,11 +268,17 @@ fn read<A: Api>(
     inputs: &[A::Buffer],
     own: &[A::Buffer],
 ) -> Result<Vec<u32>, RunError> {
-    let mut lanes = vec![];
+    if let [(part, range)] = pieces
+        && range.len() <= READ
+    {
+        return api.read(bound(part.arena, inputs, own), part.offset as usize, range.len());
+    }
+    let mut lanes = Vec::with_capacity(pieces.iter().map(|(_, range)| range.len()).sum());
     for (part, range) in pieces {
-        let found = api.read(bound(part.arena, inputs, own), part.offset as usize, range.len())?;
-        // Mostly there is one piece, which is not copied again.
-        if lanes.is_empty() { lanes = found } else { lanes.extend(found) }
+        for done in (0..range.len()).step_by(READ) {
+            let count = READ.min(range.len() - done);
+            lanes.extend(api.read(bound(part.arena, inputs, own), part.offset as usize + done, count)?);
+        }
     }
     Ok(lanes)
 }

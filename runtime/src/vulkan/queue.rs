@@ -135,8 +135,9 @@ impl Queue {
     /// The same, and waits for all of it.
     pub fn submit_and_wait(&mut self, program: Option<vk::CommandBuffer>) -> Result<(), RunError> {
         let at = self.at;
-        self.submit(program)?;
-        self.wait(at)
+        let submitted = self.submit(program);
+        // Also after an error: whoever hears of it may free what is in use.
+        submitted.and(self.wait(at))
     }
 
     /// Waits until a frame may be used again.
@@ -184,9 +185,12 @@ impl Queue {
 
 impl Drop for Queue {
     fn drop(&mut self) {
-        // SAFETY: after the wait nothing of this queue is under way; a lost device has no work either.
+        // Only for this queue's own work: to wait for the device, no other session may submit meanwhile.
+        for at in 0..self.frames.len() {
+            let _ = self.wait(at);
+        }
+        // SAFETY: after the waits nothing of this queue is under way; a lost device has no work either.
         unsafe {
-            let _ = self.gpu.device.device_wait_idle();
             self.frames.iter().for_each(|f| self.gpu.device.destroy_fence(f.done, None));
             self.gpu.device.destroy_command_pool(self.pool, None);
         }
@@ -235,6 +239,23 @@ mod tests {
         assert!(queue.read(&buffer, 0, lanes).unwrap() == expected);
         assert_eq!(queue.read(&buffer, 4 * 3, 2).unwrap(), expected[3..5]);
         assert_eq!(queue.read(&buffer, 0, 0).unwrap(), []);
+    }
+
+    /// An error does not leave what was submitted under way: its buffers may go.
+    #[test]
+    fn errors_are_told_after_the_wait() {
+        if std::env::var_os("RAYGRAD_VULKAN_VALIDATION").is_none_or(|v| v != "1") {
+            println!("skipped, RAYGRAD_VULKAN_VALIDATION is not 1");
+            return;
+        }
+        let Some(gpu) = gpu() else { return };
+        let buffer = Buffer::on_device(&gpu, "test", 16).unwrap();
+        let mut queue = Queue::new(gpu.clone()).unwrap();
+        let commands = queue.record(0).unwrap();
+        // SAFETY: recorded, inside the buffer; the size should be a multiple of four, which validation alone minds.
+        unsafe { gpu.device.cmd_fill_buffer(commands, buffer.raw, 0, 6, 0) };
+        assert!(queue.submit_and_wait(None).is_err());
+        assert!(queue.frames.iter().all(|f| !f.busy));
     }
 
     /// The test suite runs with validation: what it says must reach us.

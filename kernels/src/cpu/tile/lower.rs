@@ -371,6 +371,9 @@ impl Lowering<'_> {
         };
         let complete = self.out.tiles() / self.out.line_tiles();
         self.out.direct = complete >= 2 * MAX_CHUNKS && self.out.ops.iter().all(per_line);
+        if self.out.direct {
+            self.out.accumulated = 0;
+        }
         let units = if self.out.direct { complete } else { self.out.tiles() }.max(1);
         // A chunk's accumulators are worth a few tiles of work each.
         self.out.chunks = (units / CHUNK_TILES).next_power_of_two().clamp(units.min(2), MAX_CHUNKS);

@@ -320,7 +320,7 @@ pub struct TileProgram {
     /// Lanes of packed weights.
     pub packed: usize,
     pub accumulators: Vec<Accumulator>,
-    /// Lanes of one chunk's accumulators.
+    /// Lanes of one chunk's accumulators; if `direct`, there are none.
     pub accumulated: usize,
     /// Reductions over the inner axis alone go straight to their buffer: chunks end where a line ends.
     pub direct: bool,

@@ -60,10 +60,10 @@ pub unsafe fn pack(pack: &Pack, isa: Isa, memory: Memory, packed: &mut [f32]) {
 /// thread touches the lanes this chunk writes. Different chunks write different lanes, by construction of the plan.
 pub unsafe fn run_tiles(program: &TileProgram, c: usize, chunk: &mut Chunk) {
     debug_assert!(chunk.scratch.len() >= program.scratch && chunk.accumulators.len() >= program.accumulated);
-    let scratch = chunk.scratch.as_mut_ptr();
     for (place, bits) in &program.constants {
         chunk.scratch[*place as usize] = f32::from_bits(*bits);
     }
+    let scratch = chunk.scratch.as_mut_ptr();
     let segments = program.segments();
     for t in program.chunk_tiles(c) {
         let row0 = t % segments * program.rows;
