@@ -427,6 +427,35 @@ fn within(device: &Device, most: Limits) -> Device {
     }
 }
 
+/// A program that binds more buffers than the device has leaves nothing in its session: another one may have its inputs.
+fn a_program_that_does_not_fit_leaves_nothing(device: &Device) {
+    let device = within(device, Limits { max_buffers: 1, max_binding: u64::MAX, ..Limits::default() });
+    let row = Axis::new("row", 10);
+    let x = Tensor::parameter("x", Shape::new(&[&row], 2));
+    let rate = Tensor::per_step("rate", Shape::new(&[], 1));
+    let compiled = |step: &Step| compile(step, &device.target()).unwrap();
+    let large = compiled(&Step { outputs: vec![("y".into(), &x * &rate)], updates: vec![] });
+    let mut session = Session::new(device.clone()).unwrap();
+    assert!(session.add(large).is_err());
+    assert_eq!(session.inputs().count(), 0);
+    assert!(session.set("x", &[1.0; 20]).is_err() && session.get("x").is_err() && session.set("rate", &[1.0]).is_err());
+    let small = session.add(compiled(&Step { outputs: vec![], updates: vec![(x.clone(), &x * 2.0)] })).unwrap();
+    session.set("x", &[1.5; 20]).unwrap();
+    session.run(small).unwrap();
+    assert_eq!(session.get("x").unwrap(), [3.0; 20]);
+}
+
+/// What is longer than is read at a time arrives whole.
+fn long_inputs_are_read_back(device: &Device) {
+    let x = Tensor::data("x", Shape::new(&[&Axis::new("row", (8 << 20) + 5)], 1));
+    let step = Step { outputs: vec![("sum".into(), x.sum_over(x.axes()))], updates: vec![] };
+    let mut session = Session::new(device.clone()).unwrap();
+    session.add(compile(&step, &device.target()).unwrap()).unwrap();
+    let values: Vec<f32> = (0..x.shape().lanes()).map(|i| i as f32).collect();
+    session.set("x", &values).unwrap();
+    assert!(session.get("x").unwrap() == values);
+}
+
 /// Inputs, temporaries, scratch memory and outputs of several parts, in every kind of kernel.
 fn buffers_beyond_the_binding_limit(device: &Device) {
     let most = Limits { max_binding: 48 << 10, max_buffers: u32::MAX, ..Limits::default() };
@@ -518,6 +547,8 @@ on_every_backend!(
     compositing,
     training_follows_the_reference_and_repeats_bit_by_bit,
     two_programs_share_their_inputs,
+    a_program_that_does_not_fit_leaves_nothing,
+    long_inputs_are_read_back,
     buffers_beyond_the_binding_limit,
     networks_in_workgroups,
 );

@@ -40,6 +40,70 @@ fn every_op_on_the_cpu() {
     every_op(&Device::cpu(Some(2)).unwrap());
 }
 
+/// Lanes of `y` on every device, of an `x` with as many channels as there are values.
+fn on_every_device(axes: &[&Axis], x: &[f32], y: impl Fn(&Tensor) -> Tensor) -> Vec<(String, Vec<f32>)> {
+    let run = |device: Device| {
+        let elements: usize = axes.iter().map(|a| a.size()).product();
+        let input = Tensor::data("x", Shape::new(axes, x.len() / elements));
+        let step = Step { outputs: vec![("y".into(), y(&input))], updates: vec![] };
+        let (name, program) = (device.name(), compile(&step, &device.target()).unwrap());
+        let mut session = Session::new(device).unwrap();
+        let id = session.add(program).unwrap();
+        session.set("x", x).unwrap();
+        session.run(id).unwrap();
+        (name, session.read(id, "y").unwrap())
+    };
+    devices().into_iter().map(run).collect()
+}
+
+/// Signs of zeros, infinities, values past half the largest, and NaN: all devices agree with the CPU, and that with the reference.
+#[test]
+fn functions_at_their_edges() {
+    const X: [f32; 12] =
+        [0.0, -0.0, 1.0, -2.5, 1e-30, -1e-30, 3e38, -3e38, f32::INFINITY, f32::NEG_INFINITY, f32::NAN, 0.3];
+    let row = Axis::new("row", X.len() * X.len());
+    let pair = |i: usize| (X[i / X.len()], X[i % X.len()]);
+    let pairs: Vec<f32> = (0..row.size()).flat_map(|i| [pair(i).0, pair(i).1]).collect();
+    type Function<'f> = (&'f str, &'f dyn Fn(&Tensor) -> Tensor, fn(f32, f32) -> f32);
+    let functions: [Function; 4] = [
+        ("tanh", &|x| x.ch(0).tanh(), |x, _| x.tanh()),
+        ("atan2", &|x| x.ch(0).atan2(&x.ch(1)), |y, x| if (y, x) == (0.0, 0.0) { y } else { y.atan2(x) }),
+        ("sin", &|x| x.ch(0).sin(), |x, _| x.sin()),
+        ("cos", &|x| x.ch(0).cos(), |x, _| x.cos()),
+    ];
+    let mut failures = vec![];
+    for (name, function, expected) in functions {
+        for (device, found) in on_every_device(&[&row], &pairs, function) {
+            for (i, y) in found.into_iter().enumerate() {
+                let (at, expected) = (pair(i), expected(pair(i).0, pair(i).1));
+                let signed = name == "tanh" || name == "atan2";
+                let signs = !signed || y.is_sign_negative() == expected.is_sign_negative();
+                let same = match at.0.abs() {
+                    // Of sines that far out, no digit is right.
+                    3e38 if !signed => y.abs() < 1.001,
+                    _ => y.is_nan() && expected.is_nan() || (y - expected).abs() < 1e-6 && signs,
+                };
+                if !same {
+                    failures.push(format!("{device}: {name} at {at:?} is {y}, not {expected}"));
+                }
+            }
+        }
+    }
+    assert!(failures.is_empty(), "{}", failures.join("\n"));
+}
+
+#[test]
+fn the_largest_of_nothing_but_infinities_is_one() {
+    for rows in [3, 64, 5000] {
+        let (frame, row) = (Axis::new("frame", 2), Axis::new("row", rows));
+        let mut x = vec![f32::NEG_INFINITY; 2 * rows];
+        x[rows + 1] = -4.0;
+        for (device, found) in on_every_device(&[&frame, &row], &x, |x| x.max_over(&[&row])) {
+            assert_eq!(found, [f32::NEG_INFINITY, -4.0], "{device}, {rows} rows");
+        }
+    }
+}
+
 #[test]
 fn inputs_are_set_part_by_part() {
     for device in devices() {

@@ -66,7 +66,7 @@ pub(super) fn combine_lanes(
 pub(super) fn neutral(b: &mut Builder, kind: Reduction) -> Value {
     match kind {
         Reduction::Sum => b.f(0.0),
-        Reduction::Max => b.f(f32::MIN),
+        Reduction::Max => b.f(f32::NEG_INFINITY),
     }
 }
 

@@ -149,6 +149,10 @@ fn sine(b: &mut Builder, x: Value, shift: f32) -> Value {
     let rest = b.fma(q, high, x);
     let rest = b.fma(q, middle, rest);
     let rest = b.fma(q, low, rest);
+    // Huge arguments have no significant digits left; the result stays bounded nevertheless. NaN passes.
+    let (least, most) = (b.f(-1.6), b.f(1.6));
+    let rest = lower(b, most, rest);
+    let rest = higher(b, least, rest);
     let square = b.mul(rest, rest);
     let series = polynomial(b, square, &SIN);
     let series = b.mul(series, square);
@@ -159,6 +163,27 @@ fn sine(b: &mut Builder, x: Value, shift: f32) -> Value {
     let odd = b.less(below, pairs);
     let minus = b.unary(UnaryOperator::Negate, result);
     b.select(odd, minus, result)
+}
+
+/// The lower of a number and a value; NaN if the value is, where `Math::Min` may give the number.
+fn lower(b: &mut Builder, number: Value, x: Value) -> Value {
+    let past = b.less(number, x);
+    b.select(past, number, x)
+}
+
+/// The higher of the two, likewise.
+fn higher(b: &mut Builder, number: Value, x: Value) -> Value {
+    let past = b.less(x, number);
+    b.select(past, number, x)
+}
+
+/// The non-negative `magnitude` with the sign of `x`.
+fn with_sign(b: &mut Builder, magnitude: Value, x: Value) -> Value {
+    let (bits, sign) = (b.bitcast(x, Kind::U32), b.u(1 << 31));
+    let sign = b.and(bits, sign);
+    let bits = b.bitcast(magnitude, Kind::U32);
+    let bits = b.binary(Op::InclusiveOr, bits, sign);
+    b.bitcast(bits, Kind::F32)
 }
 
 fn polynomial(b: &mut Builder, x: Value, coefficients: &[f32]) -> Value {
@@ -172,9 +197,9 @@ fn polynomial(b: &mut Builder, x: Value, coefficients: &[f32]) -> Value {
 
 /// A polynomial near 0, else `1 - 2 / (exp(2 |x|) + 1)` with the sign of x.
 fn tanh(b: &mut Builder, x: Value) -> Value {
-    let (zero, one, two, ten, near) = (b.f(0.0), b.f(1.0), b.f(2.0), b.f(10.0), b.f(0.625));
+    let (one, two, ten, near) = (b.f(1.0), b.f(2.0), b.f(10.0), b.f(0.625));
     let size = b.math(Math::Abs, &[x]);
-    let size = b.math(Math::Min, &[size, ten]);
+    let size = lower(b, ten, size);
     let square = b.mul(size, size);
     let series = polynomial(b, square, &TANH);
     let series = b.mul(series, square);
@@ -186,19 +211,24 @@ fn tanh(b: &mut Builder, x: Value) -> Value {
     let outer = b.sub(one, part);
     let is_near = b.less(size, near);
     let result = b.select(is_near, inner, outer);
-    let minus = b.unary(UnaryOperator::Negate, result);
-    let negative = b.less(x, zero);
-    b.select(negative, minus, result)
+    with_sign(b, result, x)
 }
 
 /// The angle of the point `(x, y)`, 0 for the origin.
 fn atan2(b: &mut Builder, y: Value, x: Value) -> Value {
-    let (zero, tiny) = (b.f(0.0), b.f(f32::MIN_POSITIVE));
+    let (zero, tiny, largest) = (b.f(0.0), b.f(f32::MIN_POSITIVE), b.f(f32::MAX));
     let (ax, ay) = (b.math(Math::Abs, &[x]), b.math(Math::Abs, &[y]));
+    // Infinities become finite, so that their quotient is 1.
+    let (ax, ay) = (lower(b, largest, ax), lower(b, largest, ay));
     let steep = b.less(ax, ay);
     let smaller = b.select(steep, ax, ay);
     let larger = b.select(steep, ay, ax);
-    let larger = b.math(Math::Max, &[larger, tiny]);
+    let larger = higher(b, tiny, larger);
+    // Vulkan promises nothing of quotients by more than 2^126.
+    let (bound, down, as_it_is) = (b.f(1e30), b.f(1e-9), b.f(1.0));
+    let huge = b.less(bound, larger);
+    let scale = b.select(huge, down, as_it_is);
+    let (smaller, larger) = (b.mul(smaller, scale), b.mul(larger, scale));
     let t = b.div(smaller, larger);
     let square = b.mul(t, t);
     let series = polynomial(b, square, &ATAN);
@@ -211,9 +241,7 @@ fn atan2(b: &mut Builder, y: Value, x: Value) -> Value {
     let opposite = b.sub(half, r);
     let left = b.less(x, zero);
     let r = b.select(left, opposite, r);
-    let minus = b.unary(UnaryOperator::Negate, r);
-    let below = b.less(y, zero);
-    b.select(below, minus, r)
+    with_sign(b, r, y)
 }
 
 /// Truncates towards zero and saturates; NaN gives 0.
