@@ -92,11 +92,11 @@ impl Reader<'_> {
 
     /// The marker that comes next.
     fn marker(&mut self) -> Result<u8, String> {
+        // Any number of these may come first.
+        while self.bytes.get(self.at..self.at + 2) == Some(&[0xff, 0xff]) {
+            self.at += 1;
+        }
         match self.bytes.get(self.at..).unwrap_or_default() {
-            [0xff, 0xff, ..] => {
-                self.at += 1;
-                self.marker()
-            }
             [0xff, marker, ..] => {
                 self.at += 2;
                 Ok(*marker)
@@ -334,6 +334,7 @@ mod tests {
             assert!(damage(cut).is_some(), "{percent} %");
             assert!(damage(&[cut, &[0xff, 0xd9]].concat()).is_some(), "{percent} %, with an end");
         }
+        assert!(damage(&[&whole[..700], &vec![0xff; 1 << 20]].concat()).is_some());
         let mut zeroed = whole.clone();
         zeroed[whole.len() / 2..][..2000].fill(0);
         assert!(damage(&zeroed).is_some());
