@@ -1,17 +1,17 @@
 //! Scenes rendered by Blender scripts in the layout of NeRF's synthetic set, and those of `raygrad make-scene`.
 //!
-//! `transforms_{train,val,test}.json` give one field of view and a camera-to-world matrix a frame. The world stays as it
-//! is; depths go from 2 to 6, which fits cameras about 4 away from the origin.
+//! `transforms_{train,val,test}.json` give one field of view and a camera-to-world matrix a frame; other intrinsics count as
+//! in `transforms.json`. The world stays as it is; depths go from 2 to 6, which fits cameras about 4 away from the origin.
 
+use super::camera::Cameras;
 use super::picture::{DepthFile, image_size};
-use super::{DepthRange, Entry, Intrinsics, Listing, SceneError, WorldFrame, json};
+use super::{DepthRange, Entry, Listing, SceneError, WorldFrame, json};
+use image::metadata::Orientation;
 use serde::Deserialize;
 use std::path::Path;
 
 #[derive(Deserialize)]
 struct File {
-    /// Horizontal field of view in radians.
-    camera_angle_x: f64,
     /// Length of the depth files' unit.
     #[serde(default = "one")]
     depth_unit_scale_factor: f64,
@@ -52,31 +52,25 @@ pub(super) fn list(root: &Path) -> Result<Listing, SceneError> {
 fn entries(root: &Path, split: &str) -> Result<Vec<Entry>, SceneError> {
     let path = root.join(format!("transforms_{split}.json"));
     let file: File = json::read(&path)?;
-    let angle = file.camera_angle_x;
-    if !(angle > 0.0 && angle < std::f64::consts::PI) {
-        return Err(SceneError::Field {
-            path,
-            field: "camera_angle_x".into(),
-            expected: "an angle in radians between 0 and pi".into(),
-            found: angle.to_string(),
-        });
+    if split == "train" {
+        json::check_frames(file.frames.len(), &path)?;
     }
+    let cameras = Cameras::read(&path)?;
     let entry = |(i, frame): (usize, &Frame)| {
         let mut image = root.join(&frame.file_path);
         if !image.extension().is_some_and(|e| e == "png" || e == "jpg" || e == "jpeg") {
             image.as_mut_os_string().push(".png");
         }
-        let [height, width] = image_size(&image, (&path, format!("frames[{i}].file_path")))?;
-        let focal = 0.5 * width as f64 / (0.5 * angle).tan();
-        let (cx, cy) = (width as f64 / 2.0, height as f64 / 2.0);
+        let size = image_size(&image, (&path, format!("frames[{i}].file_path")))?;
         let pose = json::pose_of_opengl(&frame.transform_matrix, &path, format!("frames[{i}].transform_matrix"))?;
         let depth = frame.depth_file_path.as_ref();
         Ok(Entry {
             name: frame.file_path.clone(),
             image,
+            turn: Orientation::NoTransforms,
             mask: None,
             depth: depth.map(|d| DepthFile { path: root.join(d), unit: file.depth_unit_scale_factor }),
-            intrinsics: Intrinsics { fx: focal, fy: focal, cx, cy, height, width, distortion: None },
+            intrinsics: cameras.intrinsics(i, size)?,
             pose: Some(pose),
         })
     };

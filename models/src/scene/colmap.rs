@@ -8,6 +8,7 @@
 use super::normalise::normalise;
 use super::picture::image_size;
 use super::{DepthRange, Entry, Intrinsics, Listing, Pose, SceneError, check_pose, enough_to_split, every};
+use image::metadata::Orientation;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -76,7 +77,15 @@ pub(super) fn list(root: &Path) -> Result<Listing, SceneError> {
         let [height, width] = image_size(&path, (&images_file, field))?;
         let intrinsics = camera.resized(height, width);
         let name = image.name.clone();
-        entries.push(Entry { name, image: path, mask: None, depth: None, intrinsics, pose: Some(pose) });
+        entries.push(Entry {
+            name,
+            image: path,
+            turn: Orientation::NoTransforms,
+            mask: None,
+            depth: None,
+            intrinsics,
+            pose: Some(pose),
+        });
     }
     let poses: Vec<Pose> = images.iter().map(|i| i.pose).collect();
     let (frame, near) = normalise(&poses, nearest);
@@ -293,18 +302,28 @@ fn text_cameras(path: &Path) -> Result<BTreeMap<u32, Intrinsics>, SceneError> {
     Ok(cameras)
 }
 
+/// Two lines an image, the second its observations. That may be empty, and some writers leave empty lines out.
 fn text_images(path: &Path) -> Result<Vec<Image>, SceneError> {
     let mut images = vec![];
-    // Two lines an image; the second, its observations, may be empty.
-    for pair in lines(path)?.chunks(2).filter(|pair| !pair[0].1.is_empty()) {
-        let mut fields = fields(path, &pair[0]);
+    let lines = lines(path)?;
+    let mut rest = lines.iter().filter(|l| !l.1.is_empty()).peekable();
+    while let Some(line) = rest.next() {
+        let mut fields = fields(path, line);
         let id = fields.next("image")?;
         let (q, t) = (fields.floats("quaternion")?, fields.floats("translation")?);
         let camera = fields.next("camera")?;
-        let name = fields.rest.collect::<Vec<_>>().join(" ");
+        let first: String = fields.next("name")?;
+        let name = std::iter::once(first.as_str()).chain(fields.rest).collect::<Vec<_>>().join(" ");
         images.push(Image { id, camera, name, pose: pose(q, t) });
+        rest.next_if(|l| observations(&l.1));
     }
     Ok(images)
+}
+
+/// Whether a line is x, y and a point's number, any number of times.
+fn observations(line: &str) -> bool {
+    let fields: Vec<&str> = line.split_whitespace().collect();
+    fields.len().is_multiple_of(3) && fields.iter().all(|f| f.parse::<f64>().is_ok())
 }
 
 fn text_points(path: &Path) -> Result<Vec<Point>, SceneError> {

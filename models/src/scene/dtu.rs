@@ -3,11 +3,14 @@
 //!
 //! `world_mat_i` projects the world to pixels, P = K [R | -R c]; `scale_mat_i` holds the scale s and the centre m of the
 //! object, and the loaded world is (x - m) / s. The published depths, 1.2 to 5.2 at s = 300 mm, are 360 to 1560 mm.
-//! Every eighth image is for testing, from the first on.
+//! Images go with the matrices of their number. Every eighth is for testing, from number 0 on, or what [`DtuSplit`] says.
 
 use super::numpy::{self, NumpyArray};
-use super::picture::{DepthFile, file_name, image_size, images_in};
-use super::{DepthRange, Entry, Intrinsics, Listing, Pose, SceneError, WorldFrame, check_pose, enough_to_split, every};
+use super::picture::{DepthFile, file_name, image_size, images_in, numbered};
+use super::{
+    DepthRange, Entry, Intrinsics, Listing, LoadOptions, Pose, SceneError, WorldFrame, check_pose, enough_to_split,
+};
+use image::metadata::Orientation;
 use nalgebra::{Matrix3, Vector3};
 use std::path::{Path, PathBuf};
 
@@ -21,7 +24,58 @@ pub(super) fn lacks(root: &Path) -> Option<String> {
     (!root.join("image").is_dir()).then(|| "no folder `image`".to_string())
 }
 
-pub(super) fn list(root: &Path) -> Result<Listing, SceneError> {
+/// Which views are for training and which for testing, by number.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum DtuSplit {
+    /// Every eighth for testing.
+    #[default]
+    EveryEighth,
+    /// pixelNeRF's nine for training, in its order; for testing all others but those that are badly lit.
+    PixelNerf,
+    /// Eighteen for training, of which the first nine are pixelNeRF's, and sixteen for testing.
+    PixelNerfReduced,
+    /// All for both.
+    All,
+}
+
+const TRAINED: [usize; 18] = [25, 22, 28, 40, 44, 48, 0, 8, 13, 24, 30, 41, 47, 43, 29, 45, 34, 33];
+const REDUCED_TEST: [usize; 16] = [1, 2, 9, 10, 11, 12, 14, 15, 23, 26, 27, 31, 32, 35, 42, 46];
+
+impl DtuSplit {
+    pub const ALL: [DtuSplit; 4] =
+        [DtuSplit::EveryEighth, DtuSplit::PixelNerf, DtuSplit::PixelNerfReduced, DtuSplit::All];
+
+    /// As the published code calls it.
+    pub fn name(self) -> &'static str {
+        match self {
+            DtuSplit::EveryEighth => "eighth",
+            DtuSplit::PixelNerf => "pixelnerf",
+            DtuSplit::PixelNerfReduced => "pixelnerf_reduced_testset",
+            DtuSplit::All => "all",
+        }
+    }
+
+    /// The split called `name`.
+    pub fn from_name(name: &str) -> Option<DtuSplit> {
+        DtuSplit::ALL.into_iter().find(|s| s.name() == name)
+    }
+
+    /// The numbers to train on and to test with, of those that there are.
+    pub(super) fn of(self, numbers: &[usize]) -> [Vec<usize>; 2] {
+        let those = |chosen: &dyn Fn(usize) -> bool| numbers.iter().copied().filter(|n| chosen(*n)).collect();
+        match self {
+            DtuSplit::EveryEighth => [those(&|n| n % 8 != 0), those(&|n| n % 8 == 0)],
+            DtuSplit::PixelNerf => {
+                let dark = |n| matches!(n, 3..=7 | 16..=21 | 36..=39);
+                [TRAINED[..9].to_vec(), those(&|n| !dark(n) && !TRAINED[..9].contains(&n))]
+            }
+            DtuSplit::PixelNerfReduced => [TRAINED.to_vec(), REDUCED_TEST.to_vec()],
+            DtuSplit::All => [numbers.to_vec(), numbers.to_vec()],
+        }
+    }
+}
+
+pub(super) fn list(root: &Path, options: &LoadOptions) -> Result<Listing, SceneError> {
     let path = FILES.iter().map(|f| root.join(f)).find(|p| p.is_file()).unwrap_or_else(|| root.join(FILES[0]));
     let arrays = numpy::read_archive(&path, |n| n.starts_with("world_mat_") || n.starts_with("scale_mat_"))?;
     let matrix = |name: String| match arrays.get(&name) {
@@ -32,36 +86,75 @@ pub(super) fn list(root: &Path) -> Result<Listing, SceneError> {
             Err(SceneError::Field { path: path.clone(), field: name, expected, found })
         }
     };
-    let frame = frame_of(matrix("scale_mat_0".into())?, &path)?;
-    let images = images_in(&root.join("image"))?;
+    let mut images = images_in(&root.join("image"))?;
     enough_to_split(root, images.len())?;
-    let around = Around::of(root);
-    let mut entries = vec![];
-    for (i, image) in images.into_iter().enumerate() {
-        let scale = matrix(format!("scale_mat_{i}"))?;
-        if frame_of(scale, &path)? != frame {
-            let message = format!("`scale_mat_{i}` differs from `scale_mat_0`: expected one world for all images");
+    let cameras = arrays.keys().filter(|name| name.starts_with("world_mat_")).count();
+    let has = |n: &usize| arrays.contains_key(&format!("world_mat_{n}"));
+    let numbers = numbered(&mut images).map(|all| all.into_iter().map(|n| n as usize).collect::<Vec<_>>());
+    let numbers = match numbers.filter(|all| all.iter().all(has) && all.windows(2).all(|w| w[0] < w[1])) {
+        Some(numbers) => numbers,
+        // Names that say nothing: in their order.
+        None if images.len() == cameras => (0..cameras).collect(),
+        None => {
+            let (folder, found) = (root.join("image"), images.len());
+            let message = format!(
+                "has {cameras} cameras, but {} has {found} images, whose names are not the cameras' numbers",
+                folder.display()
+            );
             return Err(SceneError::Format { path, message });
+        }
+    };
+    let frame = frame_of(matrix(format!("scale_mat_{}", numbers[0]))?, &path)?;
+    let around = Around::of(root);
+    let entry = |image: PathBuf, i: usize| {
+        let field = format!("scale_mat_{i}");
+        if frame_of(matrix(field.clone())?, &path)? != frame {
+            let message =
+                format!("`{field}` differs from `scale_mat_{}`: expected one world for all images", numbers[0]);
+            return Err(SceneError::Format { path: path.clone(), message });
         }
         let field = format!("world_mat_{i}");
         let (k, pose) = decompose(&matrix(field.clone())?.values, &path, &field)?;
         let [height, width] = image_size(&image, (&path, field.clone()))?;
         let (cx, cy) = (k[(0, 2)], k[(1, 2)]);
-        if !(cx > 0.0 && cx < width as f64 && cy > 0.0 && cy < height as f64) {
+        let central = |c: f64, size: usize| (0.25..=0.75).contains(&(c / size as f64));
+        if !(central(cx, width) && central(cy, height)) {
+            let name = file_name(&image);
             return Err(SceneError::Field {
-                path,
+                path: path.clone(),
                 field,
-                expected: format!("a camera for images of {height} x {width} like {}", file_name(&image)),
-                found: format!("its principal point at ({cx:.1}, {cy:.1})"),
+                expected: format!(
+                    "a camera for {name}, of {height} x {width} pixels, with its principal point amid it"
+                ),
+                found: format!("one at ({cx:.1}, {cy:.1}); the cameras seem to be for images of another size"),
             });
         }
         let intrinsics = Intrinsics { fx: k[(0, 0)], fy: k[(1, 1)], cx, cy, height, width, distortion: None };
         let (mask, depth) = (around.mask(root, &image, i), around.depth(i));
-        entries.push(Entry { name: file_name(&image), image, mask, depth, intrinsics, pose: Some(pose) });
-    }
-    let (train, test) = every(8, entries);
+        Ok(Entry {
+            name: file_name(&image),
+            image,
+            turn: Orientation::NoTransforms,
+            mask,
+            depth,
+            intrinsics,
+            pose: Some(pose),
+        })
+    };
+    let [train, test] = options.dtu_split.of(&numbers).map(|chosen| {
+        let one = |n: usize| match numbers.iter().position(|m| *m == n) {
+            Some(place) => entry(images[place].clone(), n),
+            None => {
+                let image = root.join("image").join(format!("{n:06}.png"));
+                let field = format!("split {}", options.dtu_split.name());
+                Err(SceneError::MissingImage { path: path.clone(), field, image })
+            }
+        };
+        chosen.into_iter().map(one).collect::<Result<Vec<Entry>, SceneError>>()
+    });
     let [near, far] = NEAR_FAR_MM.map(|mm| mm * frame.scale);
-    Ok(Listing { train, val: None, test, depth: DepthRange::Metric { near, far }, frame, notes: vec![] })
+    let depth = DepthRange::Metric { near, far };
+    Ok(Listing { train: train?, val: None, test: test?, depth, frame, notes: vec![] })
 }
 
 /// The world of the object's unit sphere.
@@ -112,9 +205,14 @@ struct Around {
 
 impl Around {
     fn of(root: &Path) -> Around {
-        let scan = root.file_name().map(|n| n.to_string_lossy().into_owned());
-        let above = root.ancestors().nth(2).filter(|p| p.file_name().is_some_and(|n| n == "rs_dtu_4"));
-        Around { shared: above.and_then(Path::parent).map(Path::to_path_buf).zip(scan) }
+        let shared = |root: PathBuf| {
+            let scan = root.file_name()?.to_string_lossy().into_owned();
+            let above = root.ancestors().nth(2).filter(|p| p.file_name().is_some_and(|n| n == "rs_dtu_4"))?;
+            Some((above.parent()?.to_path_buf(), scan))
+        };
+        // The path as it was given comes first: a scan may be a link to elsewhere.
+        let full = [std::path::absolute(root), root.canonicalize()];
+        Around { shared: full.into_iter().flatten().find_map(shared) }
     }
 
     fn mask(&self, root: &Path, image: &Path, i: usize) -> Option<PathBuf> {

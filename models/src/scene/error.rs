@@ -20,6 +20,11 @@ pub enum SceneError {
         .path.display(), .found[0], .found[1], .first.display(), .expected[0], .expected[1]
     )]
     MixedSizes { path: PathBuf, found: [usize; 2], first: PathBuf, expected: [usize; 2] },
+    #[error(
+        "{} has {} x {} pixels (height x width), but {} has {} x {}, another shape: crop the images to one",
+        .path.display(), .found[0], .found[1], .first.display(), .expected[0], .expected[1]
+    )]
+    MixedShapes { path: PathBuf, found: [usize; 2], first: PathBuf, expected: [usize; 2] },
     #[error("{} has {found} images; {least} are needed to set some aside for testing", .root.display())]
     TooFew { root: PathBuf, found: usize, least: usize },
     #[error("the depth range of {from} is not usable: expected 0 < near < far, found near {near}, far {far}")]

@@ -1,8 +1,9 @@
 //! A folder of images of which nothing else is known: no poses, and a focal length from the options, from EXIF, or guessed.
 //!
-//! The last tenth of the sorted images is for testing. Depths are inverse, from 1 on, as for forward-facing captures.
+//! Photos are turned as EXIF says. The last tenth of the sorted images is for testing. Depths are inverse, from 1 on, as for
+//! forward-facing captures.
 
-use super::picture::{file_name, image_size, images_in};
+use super::picture::{file_name, images_in, numbered, upright};
 use super::{DepthRange, Entry, Intrinsics, Listing, LoadOptions, SceneError, WorldFrame, enough_to_split, last_tenth};
 use std::path::{Path, PathBuf};
 
@@ -23,13 +24,15 @@ pub(super) fn lacks(root: &Path) -> Option<String> {
 }
 
 pub(super) fn list(root: &Path, options: &LoadOptions) -> Result<Listing, SceneError> {
-    let images = images_in(&folder(root))?;
+    let mut images = images_in(&folder(root))?;
+    // 2.jpg comes before 10.jpg.
+    _ = numbered(&mut images);
     enough_to_split(root, images.len())?;
     let mut notes = vec!["no poses are known".to_string()];
     let mut guessed = 0;
     let mut entries = vec![];
     for image in images {
-        let [height, width] = image_size(&image, (root, "images".into()))?;
+        let ([height, width], turn) = upright(&image)?;
         let longer = height.max(width) as f64;
         let focal = options.focal.or_else(|| equivalent_focal(&image).map(|mm| mm / FULL_FRAME * longer));
         guessed += usize::from(focal.is_none());
@@ -44,7 +47,7 @@ pub(super) fn list(root: &Path, options: &LoadOptions) -> Result<Listing, SceneE
         }
         let (cx, cy) = (width as f64 / 2.0, height as f64 / 2.0);
         let intrinsics = Intrinsics { fx: f, fy: f, cx, cy, height, width, distortion: None };
-        entries.push(Entry { name: file_name(&image), image, mask: None, depth: None, intrinsics, pose: None });
+        entries.push(Entry { name: file_name(&image), image, turn, mask: None, depth: None, intrinsics, pose: None });
     }
     if guessed > 0 {
         notes.push(format!("the focal length of {guessed} images is a guess: {GUESS} times the longer side"));

@@ -17,6 +17,15 @@ pub(super) fn read<T: DeserializeOwned>(path: &Path) -> Result<T, SceneError> {
     })
 }
 
+/// Refuses a file without frames.
+pub(super) fn check_frames(count: usize, path: &Path) -> Result<(), SceneError> {
+    if count > 0 {
+        return Ok(());
+    }
+    let (expected, found) = ("at least one frame".to_string(), "none".to_string());
+    Err(SceneError::Field { path: path.into(), field: "frames".into(), expected, found })
+}
+
 /// The pose of a camera-to-world matrix with OpenGL axes (x right, y up, z back): with F = diag(1, -1, -1),
 /// R = F R_c^T and t = -F R_c^T t_c.
 pub(super) fn pose_of_opengl(rows: &[Vec<f64>], path: &Path, field: String) -> Result<Pose, SceneError> {

@@ -2,7 +2,8 @@
 //!
 //! A row of the file holds a 3 x 5 matrix (columns down, right, back, centre, then height, width, focal length) and the
 //! nearest and farthest depth. The world is scaled so that the nearest depth of all is 1 / 0.75, and turned and moved so
-//! that the average camera is the identity; depths are then inverse, from 1 on. The last tenth is for testing.
+//! that the average camera is the identity; depths are then inverse, from 1 on. Rows are in the plain order of the images'
+//! names: 10.png before 2.png. The last tenth is for testing.
 
 use super::frame::nearest_rotation;
 use super::json::{FLIP, opengl};
@@ -10,6 +11,7 @@ use super::numpy::{self, NumpyArray};
 use super::picture::{file_name, image_size, images_in};
 use super::{DepthRange, Entry, Intrinsics, Listing, LoadOptions, Pose, SceneError, WorldFrame};
 use super::{check_pose, enough_to_split, last_tenth};
+use image::metadata::Orientation;
 use nalgebra::{Matrix3, Vector3};
 use std::path::{Path, PathBuf};
 
@@ -22,11 +24,11 @@ pub(super) fn lacks(root: &Path) -> Option<String> {
 pub(super) fn list(root: &Path, options: &LoadOptions) -> Result<Listing, SceneError> {
     let path = root.join(FILE);
     let cameras = Cameras::of(&numpy::read(&path)?, &path)?;
-    let images = images_in(&image_folder(root, options.size)?)?;
+    let folder = image_folder(root)?;
+    let images = images_in(&folder)?;
     if images.len() != cameras.poses.len() {
         let (rows, found) = (cameras.poses.len(), images.len());
-        let message =
-            format!("has {rows} cameras, but {} has {found} images", image_folder(root, options.size)?.display());
+        let message = format!("has {rows} cameras, but {} has {found} images", folder.display());
         return Err(SceneError::Format { path, message });
     }
     enough_to_split(root, images.len())?;
@@ -35,34 +37,30 @@ pub(super) fn list(root: &Path, options: &LoadOptions) -> Result<Listing, SceneE
     for (i, (image, pose)) in images.into_iter().zip(&cameras.poses).enumerate() {
         let [height, width] = image_size(&image, (&path, format!("row {i}")))?;
         let intrinsics = cameras.intrinsics.resized(height, width);
-        entries.push(Entry { name: file_name(&image), image, mask: None, depth: None, intrinsics, pose: Some(*pose) });
+        entries.push(Entry {
+            name: file_name(&image),
+            image,
+            turn: Orientation::NoTransforms,
+            mask: None,
+            depth: None,
+            intrinsics,
+            pose: Some(*pose),
+        });
     }
     let (train, test) = last_tenth(entries);
     Ok(Listing { train, val: None, test, depth: DepthRange::Inverse { near: 1.0 }, frame, notes: vec![] })
 }
 
-/// The smallest folder of images that are at least as large as wanted, else the largest.
-fn image_folder(root: &Path, wanted: Option<[usize; 2]>) -> Result<PathBuf, SceneError> {
-    let mut folders = vec![];
+/// The folder of images in full resolution, else the largest.
+fn image_folder(root: &Path) -> Result<PathBuf, SceneError> {
     for name in ["images", "images_2", "images_4", "images_8"] {
         let folder = root.join(name);
-        if folder.is_dir()
-            && let Some(first) = images_in(&folder)?.first()
-        {
-            let [height, width] = image_size(first, (&folder, name.into()))?;
-            folders.push((height, width, folder));
+        if folder.is_dir() && !images_in(&folder)?.is_empty() {
+            return Ok(folder);
         }
     }
-    folders.sort();
-    let enough =
-        |(h, w, _): &&(usize, usize, PathBuf)| wanted.is_some_and(|[height, width]| *h >= height && *w >= width);
-    match folders.iter().find(enough).or(folders.last()) {
-        Some((_, _, folder)) => Ok(folder.clone()),
-        None => {
-            let source = std::io::Error::new(std::io::ErrorKind::NotFound, "no PNG or JPEG images in it");
-            Err(SceneError::Read { path: root.join("images"), source })
-        }
-    }
+    let source = std::io::Error::new(std::io::ErrorKind::NotFound, "no PNG or JPEG images in it");
+    Err(SceneError::Read { path: root.join("images"), source })
 }
 
 /// What the file says.
@@ -119,8 +117,12 @@ pub(super) fn average_camera(poses: &[Pose], scale: f64, published: bool) -> Wor
     let n = poses.len() as f64;
     let mean = |f: &dyn Fn(&Pose) -> Vector3<f64>| poses.iter().map(f).sum::<Vector3<f64>>() / n;
     // Rows of R are the camera's axes in the world: right, down, forward.
-    let up = mean(&|p| -p.rotation.row(1).transpose()).normalize();
-    let back = mean(&|p| -p.rotation.row(2).transpose()).normalize();
+    // Directions that cancel each other out have no average: the first camera's count then.
+    let axis = |i: usize| {
+        let along = |p: &Pose| -p.rotation.row(i).transpose();
+        mean(&along).try_normalize(1e-9).or_else(|| poses.first().map(along)).unwrap_or_else(Vector3::zeros)
+    };
+    let (up, back) = (axis(1), axis(2));
     let average = Matrix3::from_columns(&[up.cross(&back), up, back]);
     let average = if published { average } else { nearest_rotation(&average) };
     let linear = FLIP * average.transpose();

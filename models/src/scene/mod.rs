@@ -6,11 +6,14 @@
 //! removed while loading. [`WorldFrame`] leads back to the world of the files.
 
 mod blender;
+mod camera;
+mod check;
 mod colmap;
 mod dtu;
 mod error;
 mod folder;
 mod frame;
+mod jpeg;
 mod json;
 mod llff;
 pub mod make_scene;
@@ -23,12 +26,15 @@ pub mod plot;
 mod resize;
 mod transforms;
 
+pub use dtu::DtuSplit;
 pub use error::SceneError;
 pub use frame::WorldFrame;
 pub use named_poses::{NamedPoses, World};
 pub use noise::{InitialPoses, NoiseError, PoseStart};
 
 use crate::geometry::Pose;
+use check::{check_depth, check_pose, check_sizes, enough_to_split};
+use image::metadata::Orientation;
 use picture::{DepthFile, read_view};
 use rayon::prelude::*;
 use std::fmt;
@@ -181,6 +187,8 @@ pub struct LoadOptions {
     pub focal: Option<f64>,
     /// Leave the depths of training views on the disk.
     pub no_train_depths: bool,
+    /// For DTU scans; other layouts have one split.
+    pub dtu_split: DtuSplit,
     /// Keep the rotations that the published loaders of forward-facing scenes produce, which are not exactly rotations,
     /// instead of the nearest ones.
     pub published_rotations: bool,
@@ -206,6 +214,8 @@ pub struct Scene {
 struct Entry {
     name: String,
     image: PathBuf,
+    /// What is done to the image before anything else; known cameras are those of the file's own pixels.
+    turn: Orientation,
     mask: Option<PathBuf>,
     depth: Option<DepthFile>,
     /// For the image file's own size.
@@ -224,9 +234,6 @@ struct Listing {
     frame: WorldFrame,
     notes: Vec<String>,
 }
-
-/// Images of which some are set aside must be at least so many.
-const LEAST_TO_SPLIT: usize = 10;
 
 impl Layout {
     /// What of this layout the folder lacks; `None` if it looks like one.
@@ -258,8 +265,8 @@ impl Layout {
 /// Loads the scene in the folder `root`. `progress` hears how many of how many images are there, from any thread.
 ///
 /// # Errors
-/// Files that are missing or damaged, metadata that make no sense, too few images to split, images of different sizes
-/// where no size is asked for, a folder that holds no scene.
+/// Files that are missing or damaged, metadata that make no sense, too few images to split, images of different shapes, or
+/// sizes where none is asked for, a folder that holds no scene.
 pub fn load(root: &Path, options: &LoadOptions, progress: &(dyn Fn(usize, usize) + Sync)) -> Result<Scene, SceneError> {
     let layout = match options.layout {
         Some(layout) => match layout.lacks(root) {
@@ -271,7 +278,7 @@ pub fn load(root: &Path, options: &LoadOptions, progress: &(dyn Fn(usize, usize)
     let mut listing = match layout {
         Layout::Blender => blender::list(root),
         Layout::Llff => llff::list(root, options),
-        Layout::Dtu => dtu::list(root),
+        Layout::Dtu => dtu::list(root, options),
         Layout::Transforms => transforms::list(root),
         Layout::Colmap => colmap::list(root),
         Layout::Folder => folder::list(root, options),
@@ -292,9 +299,7 @@ pub fn load(root: &Path, options: &LoadOptions, progress: &(dyn Fn(usize, usize)
     if trained == 0 {
         return Err(SceneError::TooFew { root: root.into(), found: 0, least: 1 });
     }
-    if options.size.is_none() {
-        check_sizes(&entries)?;
-    }
+    check_sizes(&entries, options.size.is_some())?;
     let done = AtomicUsize::new(0);
     let read = |entry: &&Entry| {
         let view = read_view(entry, &listing.frame, options)?;
@@ -311,45 +316,6 @@ pub fn load(root: &Path, options: &LoadOptions, progress: &(dyn Fn(usize, usize)
     Ok(Scene { layout, root: root.into(), val, test, depth, frame: listing.frame, notes: listing.notes, train: views })
 }
 
-fn check_depth(depth: DepthRange, from: &str) -> Result<(), SceneError> {
-    let (near, far) = match depth {
-        DepthRange::Metric { near, far } => (near, far),
-        DepthRange::Inverse { near } => (near, f64::INFINITY),
-    };
-    // Written so that anything that is no number fails.
-    let usable = near > 0.0 && near < far && (far.is_finite() || matches!(depth, DepthRange::Inverse { .. }));
-    if usable { Ok(()) } else { Err(SceneError::Depth { from: from.to_string(), near, far }) }
-}
-
-fn check_sizes(entries: &[&Entry]) -> Result<(), SceneError> {
-    let size = |e: &Entry| [e.intrinsics.height, e.intrinsics.width];
-    let Some(first) = entries.first() else { return Ok(()) };
-    match entries.iter().find(|e| size(e) != size(first)) {
-        None => Ok(()),
-        Some(other) => Err(SceneError::MixedSizes {
-            path: other.image.clone(),
-            found: size(other),
-            first: first.image.clone(),
-            expected: size(first),
-        }),
-    }
-}
-
-/// Refuses a pose of a file that has something else than finite numbers in it, or no rotation.
-fn check_pose(pose: Pose, path: &Path, field: impl Fn() -> String) -> Result<Pose, SceneError> {
-    let refuse = |expected: &str, found: String| {
-        Err(SceneError::Field { path: path.into(), field: field(), expected: expected.into(), found })
-    };
-    if let Some(x) = pose.to_rows().iter().find(|x| !x.is_finite()) {
-        return refuse("finite numbers", x.to_string());
-    }
-    match pose.rigidity_error() {
-        e if e.is_infinite() => refuse("a rotation", "a reflection or a singular matrix".into()),
-        e if e > 1e-3 => refuse("a rotation", format!("a matrix with R R^T off the identity by {e:.1e}")),
-        _ => Ok(pose),
-    }
-}
-
 /// Every nth of a list, from the first on, set aside: (the others, the chosen).
 fn every<T>(n: usize, all: Vec<T>) -> (Vec<T>, Vec<T>) {
     let (chosen, others): (Vec<_>, Vec<_>) = all.into_iter().enumerate().partition(|(i, _)| i % n == 0);
@@ -363,30 +329,5 @@ fn last_tenth<T>(mut all: Vec<T>) -> (Vec<T>, Vec<T>) {
     (all, last)
 }
 
-fn enough_to_split(root: &Path, found: usize) -> Result<(), SceneError> {
-    if found < LEAST_TO_SPLIT {
-        return Err(SceneError::TooFew { root: root.into(), found, least: LEAST_TO_SPLIT });
-    }
-    Ok(())
-}
-
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn resizing_scales_each_axis_by_itself() {
-        let phone = Intrinsics {
-            fx: 1606.5,
-            fy: 1606.5,
-            cx: 960.0,
-            cy: 540.0,
-            height: 1080,
-            width: 1920,
-            distortion: Some([0.1, 0.0, 0.0, 0.0]),
-        };
-        let small = phone.resized(480, 640);
-        assert_eq!([small.fx, small.fy, small.cx, small.cy], [535.5, 714.0, 320.0, 240.0]);
-        assert_eq!((small.height, small.width, small.distortion), (480, 640, phone.distortion));
-    }
-}
+mod tests;

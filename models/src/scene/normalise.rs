@@ -16,6 +16,9 @@ const PARALLEL: f64 = 0.02;
 /// LLFF's scenes, whose nearest depth is 4/3, it is about this.
 const SPREAD: f64 = 0.3;
 
+/// Centres that spread less than this share of their distance from the origin are one, but for rounding.
+const ROUNDING: f64 = 1e-9;
+
 /// How cameras stand to each other.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Arrangement {
@@ -28,8 +31,19 @@ pub(super) enum Arrangement {
     Forward,
 }
 
+/// Root mean square distance of the cameras from their mean; 0 where only rounding tells them apart.
+fn spread(poses: &[Pose]) -> f64 {
+    let n = poses.len().max(1) as f64;
+    let mean = poses.iter().map(Pose::center).sum::<Vector3<f64>>() / n;
+    let spread = (poses.iter().map(|p| (p.center() - mean).norm_squared()).sum::<f64>() / n).sqrt();
+    if spread > ROUNDING * mean.norm() { spread } else { 0.0 }
+}
+
 impl Arrangement {
     pub fn of(poses: &[Pose]) -> Arrangement {
+        if spread(poses) == 0.0 {
+            return Arrangement::Forward;
+        }
         let n = poses.len().max(1) as f64;
         let (mut normal, mut right) = (Matrix3::zeros(), Vector3::zeros());
         for p in poses {
@@ -63,13 +77,10 @@ pub(super) fn normalise(poses: &[Pose], nearest: Option<f64>) -> (WorldFrame, f6
             (frame, scale * nearest.map_or(0.5 * least_distance, |z| 0.75 * z))
         }
         Arrangement::Forward => {
-            let n = poses.len().max(1) as f64;
-            let mean = poses.iter().map(Pose::center).sum::<Vector3<f64>>() / n;
-            let spread = (poses.iter().map(|p| (p.center() - mean).norm_squared()).sum::<f64>() / n).sqrt();
-            let scale = match nearest {
-                Some(z) => 1.0 / (0.75 * z),
-                None if spread > 0.0 => SPREAD / spread,
-                None => 1.0,
+            let scale = match (nearest, spread(poses)) {
+                (Some(z), _) => 1.0 / (0.75 * z),
+                (None, 0.0) => 1.0,
+                (None, spread) => SPREAD / spread,
             };
             (average_camera(poses, scale, false), 1.0)
         }
@@ -114,5 +125,21 @@ mod tests {
         let mean = wall.iter().map(|p| frame.load(p).center()).sum::<Vector3<f64>>() / 12.0;
         assert!(mean.norm() < 1e-9);
         assert!(wall.iter().all(|p| frame.load(p).rotation.trace() > 2.9));
+    }
+
+    /// Cameras that only turn have no scale, whatever rounding makes of their centres.
+    #[test]
+    fn cameras_in_one_place() {
+        let place = Vector3::new(11.3, -7.1, 3.7);
+        for turn in [0.02, 0.5] {
+            let turned = |i: i32| {
+                let a = f64::from(i) * turn;
+                looking(place, Vector3::new(a.cos(), a.sin(), 0.1))
+            };
+            let poses: Vec<Pose> = (0..12).map(turned).collect();
+            assert!(poses.iter().any(|p| p.center() != poses[0].center()));
+            let (frame, near) = normalise(&poses, None);
+            assert_eq!((frame.scale, near), (1.0, 1.0), "{turn}");
+        }
     }
 }

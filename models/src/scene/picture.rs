@@ -1,8 +1,10 @@
 //! Images, masks and depth maps of one view: read, undistorted, resized.
 
+use super::check::same_shape;
 use super::resize::Bytes;
-use super::{Entry, Intrinsics, LoadOptions, SceneError, View, WorldFrame, numpy};
-use image::{DynamicImage, ImageReader};
+use super::{Entry, Intrinsics, LoadOptions, SceneError, View, WorldFrame, jpeg, numpy};
+use image::metadata::Orientation;
+use image::{DynamicImage, ImageDecoder, ImageReader};
 use std::path::{Path, PathBuf};
 
 /// A file of depths along the optical axis: NumPy (`.npy`), PFM (`.pfm`) or a 16-bit grey PNG.
@@ -22,7 +24,19 @@ pub(super) fn image_size(path: &Path, named_by: (&Path, String)) -> Result<[usiz
     Ok([height as usize, width as usize])
 }
 
-/// The images of a folder, by name; by number where all names are numbers.
+/// Height and width of a photo held upright, and the turn that EXIF says gets it there.
+pub(super) fn upright(path: &Path) -> Result<([usize; 2], Orientation), SceneError> {
+    use Orientation::{Rotate90, Rotate90FlipH, Rotate270, Rotate270FlipH};
+    let refuse = |e| decode_error(path, e);
+    let mut decoder = open(path)?.into_decoder().map_err(refuse)?;
+    let (width, height) = decoder.dimensions();
+    let (height, width) = (height as usize, width as usize);
+    let turn = decoder.orientation().map_err(refuse)?;
+    let lies = matches!(turn, Rotate90 | Rotate270 | Rotate90FlipH | Rotate270FlipH);
+    Ok((if lies { [width, height] } else { [height, width] }, turn))
+}
+
+/// The images of a folder, in the plain order of their names.
 pub(super) fn images_in(folder: &Path) -> Result<Vec<PathBuf>, SceneError> {
     let refuse = |source| SceneError::Read { path: folder.into(), source };
     let mut found = vec![];
@@ -33,12 +47,17 @@ pub(super) fn images_in(folder: &Path) -> Result<Vec<PathBuf>, SceneError> {
             found.push(path);
         }
     }
-    let number = |p: &PathBuf| p.file_stem()?.to_str()?.parse::<u64>().ok();
-    match found.iter().all(|p| number(p).is_some()) {
-        true => found.sort_by_key(|p| (number(p), p.clone())),
-        false => found.sort(),
-    }
+    found.sort();
     Ok(found)
+}
+
+/// The numbers that images are called, where all are; their order becomes that of the numbers.
+pub(super) fn numbered(images: &mut [PathBuf]) -> Option<Vec<u64>> {
+    let number = |p: &PathBuf| p.file_stem()?.to_str()?.parse::<u64>().ok();
+    let mut numbers: Vec<u64> = images.iter().map(number).collect::<Option<_>>()?;
+    numbers.sort_unstable();
+    images.sort_by_key(|p| (number(p), p.clone()));
+    Some(numbers)
 }
 
 /// The file's name, without its folder.
@@ -56,14 +75,22 @@ fn decode_error(path: &Path, source: image::ImageError) -> SceneError {
 }
 
 fn decode(path: &Path) -> Result<DynamicImage, SceneError> {
-    open(path)?.decode().map_err(|e| decode_error(path, e))
+    let bytes = std::fs::read(path).map_err(|source| SceneError::Read { path: path.into(), source })?;
+    if bytes.starts_with(&[0xff, 0xd8])
+        && let Some(damage) = jpeg::damage(&bytes)
+    {
+        return Err(SceneError::Format { path: path.into(), message: format!("a damaged JPEG image: {damage}") });
+    }
+    let reader = ImageReader::new(std::io::Cursor::new(bytes)).with_guessed_format();
+    reader.map_err(Into::into).and_then(ImageReader::decode).map_err(|e| decode_error(path, e))
 }
 
 /// The view of an entry.
 pub(super) fn read_view(entry: &Entry, frame: &WorldFrame, options: &LoadOptions) -> Result<View, SceneError> {
     let native = entry.intrinsics;
     let [height, width] = options.size.unwrap_or([native.height, native.width]);
-    let image = decode(&entry.image)?;
+    let mut image = decode(&entry.image)?;
+    image.apply_orientation(entry.turn);
     let transparent = image.color().has_alpha();
     let bytes = match transparent {
         true => bytes_of(4, &image, image.to_rgba8().into_raw()),
@@ -77,12 +104,13 @@ pub(super) fn read_view(entry: &Entry, frame: &WorldFrame, options: &LoadOptions
         true => bytes.data.as_chunks::<4>().0.to_vec(),
         false => bytes.data.as_chunks::<3>().0.iter().map(opaque).collect(),
     };
+    let places = Places { native: &native, lens: lens.as_ref(), size: [height, width] };
     let mask = match &entry.mask {
-        Some(path) => Some(read_mask(path, &native, lens.as_ref(), [height, width])?),
+        Some(path) => Some(read_mask(path, &places)?),
         None => None,
     };
     let depth = match &entry.depth {
-        Some(file) => Some(read_depth(file, &native, lens.as_ref(), [height, width], frame.scale)?),
+        Some(file) => Some(read_depth(file, &places, frame.scale)?),
         None => None,
     };
     let intrinsics = Intrinsics { distortion: None, ..native.resized(height, width) };
@@ -105,41 +133,64 @@ fn bytes_of(channels: usize, image: &DynamicImage, data: Vec<u8>) -> Bytes {
     Bytes { channels, height: image.height() as usize, width: image.width() as usize, data }
 }
 
-/// A mask: whether all of a pixel is foreground (white in the file).
-fn read_mask(
-    path: &Path,
-    native: &Intrinsics,
-    lens: Option<&Lens>,
-    [height, width]: [usize; 2],
-) -> Result<Vec<bool>, SceneError> {
-    let image = decode(path)?;
-    let first = image.to_rgb8().into_raw().chunks_exact(3).map(|p| if p[0] == 255 { 255 } else { 0 }).collect();
-    let bytes = bytes_of(1, &image, first);
-    same_size(path, [bytes.height, bytes.width], native)?;
-    let flat = lens.map_or(bytes.clone(), |lens| lens.remove(&bytes));
-    Ok(flat.resized(height, width).data.iter().map(|b| *b == 255).collect())
+/// Where the pixels of a loaded view lie in a file that goes with its image: resized, and seen through the lens.
+struct Places<'a> {
+    native: &'a Intrinsics,
+    lens: Option<&'a Lens>,
+    size: [usize; 2],
 }
 
-fn same_size(path: &Path, found: [usize; 2], native: &Intrinsics) -> Result<(), SceneError> {
-    if found == [native.height, native.width] {
-        return Ok(());
+impl Places<'_> {
+    /// Row and column, at which pixel centres are halves, of every pixel in a file of `size`.
+    fn each(&self, [rows, columns]: [usize; 2]) -> impl Iterator<Item = [f64; 2]> {
+        let [height, width] = self.size;
+        let native = self.native;
+        let scale = |to: usize, from: usize| to as f64 / from as f64;
+        let pixels = (0..height).flat_map(move |i| (0..width).map(move |j| [i as f64 + 0.5, j as f64 + 0.5]));
+        pixels.map(move |[y, x]| match self.lens {
+            None => [y * scale(rows, height), x * scale(columns, width)],
+            Some(lens) => {
+                let [u, v] = lens.distort([x * scale(native.width, width), y * scale(native.height, height)]);
+                [v * scale(rows, native.height), u * scale(columns, native.width)]
+            }
+        })
     }
-    Err(SceneError::Field {
-        path: path.into(),
-        field: "size".into(),
-        expected: format!("{} x {}, as the image", native.height, native.width),
-        found: format!("{} x {}", found[0], found[1]),
-    })
+
+    /// Refuses a file that is no resized image of the same.
+    fn check(&self, path: &Path, found: [usize; 2]) -> Result<(), SceneError> {
+        let native = [self.native.height, self.native.width];
+        if found[0] > 0 && found[1] > 0 && same_shape(found, native) {
+            return Ok(());
+        }
+        Err(SceneError::Field {
+            path: path.into(),
+            field: "size".into(),
+            expected: format!("{} x {}, as the image, or that resized", native[0], native[1]),
+            found: format!("{} x {}", found[0], found[1]),
+        })
+    }
+}
+
+/// A mask: whether all that a bilinear lookup sees is foreground (white in the file).
+fn read_mask(path: &Path, places: &Places) -> Result<Vec<bool>, SceneError> {
+    let image = decode(path)?.to_rgb8();
+    let [rows, columns] = [image.height() as usize, image.width() as usize];
+    places.check(path, [rows, columns])?;
+    let white = |i: usize, j: usize| image.as_raw()[3 * (i * columns + j)] == 255;
+    let ends = |x: f64, size: usize| {
+        let x = inside(x - 0.5, size);
+        // Not the next pixel for a rounding.
+        [(x + 1e-6).floor() as usize, (x - 1e-6).ceil() as usize]
+    };
+    let seen = |[y, x]: [f64; 2]| {
+        let (upper, left) = (ends(y, rows), ends(x, columns));
+        upper.iter().all(|i| left.iter().all(|j| white(*i, *j)))
+    };
+    Ok(places.each([rows, columns]).map(seen).collect())
 }
 
 /// Depths by nearest neighbour, in the loaded world's unit.
-fn read_depth(
-    file: &DepthFile,
-    native: &Intrinsics,
-    lens: Option<&Lens>,
-    [height, width]: [usize; 2],
-    scale: f64,
-) -> Result<Vec<f32>, SceneError> {
+fn read_depth(file: &DepthFile, places: &Places, scale: f64) -> Result<Vec<f32>, SceneError> {
     let path = &file.path;
     let ([rows, columns], values) = match path.extension().and_then(|e| e.to_str()) {
         Some("npy") => {
@@ -156,25 +207,14 @@ fn read_depth(
             (size, image.to_luma16().into_raw().into_iter().map(f64::from).collect())
         }
     };
+    places.check(path, [rows, columns])?;
     let unit = file.unit * scale;
-    let nearest = |x: f64, from: usize, to: usize| ((x * from as f64 / to as f64).max(0.0) as usize).min(from - 1);
-    let mut depths = Vec::with_capacity(height * width);
-    for i in 0..height {
-        for j in 0..width {
-            let (y, x) = (i as f64 + 0.5, j as f64 + 0.5);
-            let (y, x) = match lens {
-                Some(lens) => {
-                    let (sy, sx) = (native.height as f64 / height as f64, native.width as f64 / width as f64);
-                    let [u, v] = lens.distort([x * sx, y * sy]);
-                    (v / sy, u / sx)
-                }
-                None => (y, x),
-            };
-            let depth = values[nearest(y, rows, height) * columns + nearest(x, columns, width)] * unit;
-            depths.push(if depth.is_finite() && depth > 0.0 { depth as f32 } else { 0.0 });
-        }
-    }
-    Ok(depths)
+    let nearest = |x: f64, size: usize| (x.max(0.0) as usize).min(size - 1);
+    let depth = |[y, x]: [f64; 2]| {
+        let depth = values[nearest(y, rows) * columns + nearest(x, columns)] * unit;
+        if depth.is_finite() && depth > 0.0 { depth as f32 } else { 0.0 }
+    };
+    Ok(places.each([rows, columns]).map(depth).collect())
 }
 
 /// A grey portable float map: three header lines, then floats from the bottom row up, little-endian if the scale is

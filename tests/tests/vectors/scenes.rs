@@ -118,7 +118,7 @@ fn fern_loads() {
     let Some(scene) = scene("llff/fern", &small([90, 120])) else { return };
     sound(&scene, [90, 120], [18, 2, 2]);
     assert_eq!((scene.layout, scene.depth), (Layout::Llff, DepthRange::Inverse { near: 1.0 }));
-    assert_eq!(scene.test[1].name, "image019.png");
+    assert_eq!(scene.test[1].name, "IMG_4045.jpg");
     let center = scene.train.iter().map(|v| v.pose.unwrap().center()).sum::<nalgebra::Vector3<f64>>() / 18.0;
     assert!(center.norm() < 0.1, "{center}");
 }

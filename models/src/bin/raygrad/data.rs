@@ -4,7 +4,7 @@ use crate::{print, progress};
 use clap::Args;
 use raygrad::Error;
 use raygrad::run::files::write_atomically;
-use raygrad::scene::{DepthRange, Layout, LoadOptions, Scene, SceneError, View, load, plot};
+use raygrad::scene::{DepthRange, Layout, LoadOptions, Scene, SceneError, View, load, plot, stand_around};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -46,6 +46,12 @@ pub fn run(args: &DataArgs) -> anyhow::Result<ExitCode> {
     });
     let scene = loaded.map_err(Error::from)?;
     print(&summary(&scene))?;
+    if starts_blind(&scene) {
+        eprintln!(
+            "warning: the cameras stand around something; training that starts captures from the identity finds cameras \
+             that look the same way only: give it rough poses (scene.poses)"
+        );
+    }
     if let Some(path) = &args.plot {
         let bytes = match path.extension().is_some_and(|e| e == "svg") {
             true => plot::svg(&scene).map_err(Error::from)?.into_bytes(),
@@ -55,6 +61,12 @@ pub fn run(args: &DataArgs) -> anyhow::Result<ExitCode> {
         print(&format!("plot          {}\n", path.display()))?;
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// Whether training would start from poses that it cannot get away from.
+fn starts_blind(scene: &Scene) -> bool {
+    let poses: Vec<_> = scene.train.iter().filter_map(|v| v.pose).collect();
+    scene.layout.is_capture() && stand_around(&poses)
 }
 
 fn summary(scene: &Scene) -> String {
