@@ -16,9 +16,9 @@ use crate::planar::{PlanarData, Trainer};
 use crate::radiance::data::START;
 use crate::radiance::{Explorer, SpaceData};
 use crate::report::median;
-use crate::run::RunFolder;
 use crate::run::checkpoint::Checkpoint;
 use crate::run::metrics::{Entry, Metrics};
+use crate::run::{FolderError, RunFolder};
 use crate::training::{Training, due};
 use crate::warps::{self, Warp};
 use raygrad_runtime::{Device, DeviceError};
@@ -242,7 +242,7 @@ impl Experiment {
     pub fn train_observed(&self, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<Outcome, Error> {
         self.layered.validate()?;
         let settings = &self.layered.settings;
-        let path = self.folder();
+        let mut path = self.folder();
         // Refuse a folder before the work of compiling, and again look at it before the first write.
         let mut folder = match self.resume {
             true => RunFolder::reopen(&path, settings)?,
@@ -255,7 +255,15 @@ impl Experiment {
             run.kept = Some(checkpoint.step);
             (run.metrics.steps, run.seconds) = (checkpoint.steps, checkpoint.seconds);
         } else {
-            folder.start(settings)?;
+            match folder.start(settings) {
+                // Nobody asked for this folder, and another run has taken it meanwhile.
+                Err(FolderError::Occupied { .. }) if self.out.is_none() => {
+                    path = self.folder();
+                    folder = RunFolder::claim(&path, settings)?;
+                    folder.start(settings)?;
+                }
+                other => other?,
+            }
             trainer.write_data(&folder)?;
         }
         folder.keep();

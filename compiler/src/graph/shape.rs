@@ -73,9 +73,9 @@ impl Shape {
             Channels::Vector(n) => (n, 1),
             Channels::Matrix(r, c) => (r, c),
         };
-        let sizes = self.axes.iter().map(Axis::size).chain([rows, columns]);
+        let mut sizes = self.axes.iter().map(Axis::size).chain([rows, columns]);
         // A lane has four bytes.
-        match sizes.fold(Some(4usize), |n, size| n?.checked_mul(size)) {
+        match sizes.try_fold(4usize, |n, size| n.checked_mul(size)) {
             Some(0) => Err(Misfit::new(format!("{self} is empty"), "axes and channels start at 1")),
             Some(bytes) if bytes <= isize::MAX as usize => Ok(()),
             _ => Err(Misfit::new(format!("{self} is larger than any memory"), "use smaller axes")),

@@ -245,7 +245,7 @@ fn outer_matches_f64_and_agrees_where_multiply_adds_are_fused() {
 /// Vectors that hold the last channels are whole: beyond them they repeat the last one, and nothing that was never written.
 #[test]
 fn the_rest_of_a_vector_repeats_the_last_channel() {
-    for form in forms().into_iter().filter(|f| *f != (Isa::AmxBf16, Products::Bf16)) {
+    for form in forms().filter(|f| *f != (Isa::AmxBf16, Products::Bf16)) {
         for n in [1, 7, 9, 17, 24, 31] {
             let (k, rows) = (70, 96);
             let ld = row_stride(rows);

@@ -9,8 +9,9 @@ use std::time::{Duration, Instant};
 const STEPS: usize = 20_000;
 
 /// GFLOP/s (a multiply-add counts twice) of `threads` threads that do nothing but multiply-adds for `ms` milliseconds,
-/// of `products`, with the best instruction set.
+/// of `products`, with the best instruction set. More threads than cores do no more together.
 pub fn peak_gflops(products: Products, threads: usize, ms: f64) -> f64 {
+    let threads = threads.min(std::thread::available_parallelism().map_or(threads, usize::from));
     let isa = Isa::detect();
     let limit = Duration::from_secs_f64(ms * 1e-3);
     std::thread::scope(|scope| {

@@ -65,6 +65,8 @@ pub struct SceneSettings {
     pub path: String,
     /// Which one, by its name, or `auto`.
     pub layout: String,
+    /// Which views of a DTU scan are for testing, by the name of a [`DtuSplit`](crate::scene::DtuSplit).
+    pub dtu_split: String,
     /// Rows, columns.
     pub image_size: [usize; 2],
     pub train_views: Count,

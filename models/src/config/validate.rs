@@ -3,12 +3,13 @@
 use super::error::ConfigError;
 use super::layers::Layered;
 use super::{Anneal, CodeKind, Count, DepthSettings, Dof, Encoding, FieldKind, ImageSize, Method, NoiseKind};
-use crate::scene::Layout;
+use crate::scene::{DtuSplit, Layout};
 
 /// Widest layer and most bands a configuration may ask for: more is a typing error, not an experiment.
 const MAX_WIDTH: usize = 4096;
 const MAX_BANDS: usize = 20;
 const MAX_BLOCKS: usize = 64;
+const MAX_PATCHES: usize = 1000;
 const MAX_SIDE: usize = 16384;
 /// Most samples of a ray.
 const MAX_SAMPLES: usize = 1024;
@@ -32,6 +33,9 @@ impl Layered {
     fn data(&self) -> Result<(), ConfigError> {
         let d = &self.settings.data;
         self.at_least("data.patches", d.patches, 1)?;
+        if d.patches > MAX_PATCHES {
+            return Err(self.refuse("data.patches", format!("expected at most {MAX_PATCHES}, found {}", d.patches)));
+        }
         if self.settings.noise.kind == NoiseKind::Barf && d.patches > 5 {
             let text = format!("the noise kind \"barf\" has shifts for at most 5 patches, found {}", d.patches);
             return Err(self.refuse("data.patches", text));
@@ -69,6 +73,11 @@ impl Layered {
             let known: Vec<&str> = Layout::ALL.iter().map(|l| l.name()).collect();
             let text = format!("expected \"auto\" or one of {}, found \"{}\"", known.join(", "), scene.layout);
             return Err(self.refuse("scene.layout", text));
+        }
+        if DtuSplit::from_name(&scene.dtu_split).is_none() {
+            let known: Vec<&str> = DtuSplit::ALL.iter().map(|s| s.name()).collect();
+            let text = format!("expected one of {}, found \"{}\"", known.join(", "), scene.dtu_split);
+            return Err(self.refuse("scene.dtu_split", text));
         }
         if !(scene.focal >= 0.0 && scene.focal.is_finite()) {
             let text = format!("expected a focal length in pixels, or 0 for none, found {}", scene.focal);

@@ -8,7 +8,7 @@ use crate::geometry::Pose;
 use crate::run::files::WriteError;
 use crate::scene::make_scene::{MakeError, MakeOptions, make_scene};
 use crate::scene::noise::{InitialPoses, NoiseError, PoseStart, Side};
-use crate::scene::{self, DepthRange, Layout, LoadOptions, NamedPoses, Scene, SceneError, View, World};
+use crate::scene::{self, DepthRange, DtuSplit, Layout, LoadOptions, NamedPoses, Scene, SceneError, View, World};
 use std::path::Path;
 
 /// The path that stands for the procedural scene.
@@ -76,6 +76,7 @@ impl SpaceData {
             val_limit: wanted.val_views.limit(),
             test_limit: wanted.test_views.limit(),
             layout: Layout::from_name(&wanted.layout),
+            dtu_split: DtuSplit::from_name(&wanted.dtu_split).unwrap_or_default(),
             focal: (wanted.focal > 0.0).then_some(wanted.focal),
             no_train_depths: true,
             ..LoadOptions::default()

@@ -2,7 +2,7 @@
 
 use super::checkpoint::MANIFEST;
 use super::files::{WriteError, write_atomically};
-use crate::config::{ConfigError, Count, DeviceChoice, Layered, Settings};
+use crate::config::{ConfigError, Count, DeviceChoice, Layered, Networks, Settings};
 use std::path::{Path, PathBuf};
 
 /// Name of the resolved settings, which mark a folder as a run's.
@@ -143,6 +143,14 @@ impl RunFolder {
         }
         std::fs::create_dir_all(&self.path)
             .map_err(|source| FolderError::Access { path: self.path.clone(), source })?;
+        // Of two runs that claimed the folder together, the one that makes the file has it.
+        let config = self.path.join(CONFIG);
+        std::fs::OpenOptions::new().write(true).create_new(true).open(&config).map_err(|source| {
+            match source.kind() == std::io::ErrorKind::AlreadyExists {
+                true => FolderError::Occupied { path: self.path.clone(), difference: None },
+                false => FolderError::Access { path: config, source },
+            }
+        })?;
         // A setting that later versions add is then what that preset says: as it was before.
         let base = if settings.scene.is_some() { "l2g-blender" } else { "planar-l2g" };
         let text = format!("base = \"{base}\"\n\n{}", toml::to_string(settings).unwrap_or_default());
@@ -194,6 +202,7 @@ pub fn difference(held: &Settings, wanted: &Settings) -> Option<String> {
     let flat = |s: &Settings| {
         let mut s = s.clone();
         (s.run.device, s.run.threads) = (DeviceChoice::Auto, Count::All);
+        (s.run.autotune, s.run.networks) = (false, Networks::Auto);
         let mut leaves = vec![];
         if let Ok(table) = toml::Table::try_from(&s) {
             for (section, values) in table {
@@ -233,6 +242,9 @@ mod tests {
         folder.start(&settings).unwrap();
         folder.keep();
         let error = |r: Result<RunFolder, FolderError>| r.unwrap_err().to_string();
+        let again = error(RunFolder::claim(&path, &settings));
+        assert!(again.contains("cut off before its first checkpoint"), "{again}");
+        std::fs::write(path.join(MANIFEST), "").unwrap();
         assert!(error(RunFolder::claim(&path, &settings)).contains("--resume"));
         let text = error(RunFolder::claim(&path, &other));
         assert!(text.contains("there `optim.steps` is 5000, here 7"), "{text}");

@@ -303,7 +303,7 @@ fn intrinsics_of_blender_scenes_count() {
     let scene = load(dir.path(), &all(), &|_, _| ()).unwrap();
     let c = scene.train[0].intrinsics;
     assert_eq!((scene.layout, [c.fx, c.fy, c.cx, c.cy]), (Layout::Blender, [20.0, 20.0, 7.0, 6.0]));
-    assert_eq!(scene.removed_distortion, Some([0.01, 0.0, 0.0, 0.0]));
+    assert_eq!(scene.train[0].removed_distortion, Some([0.01, 0.0, 0.0, 0.0]));
 }
 
 #[test]

@@ -26,8 +26,9 @@ impl CacheFile {
     }
 
     pub(super) fn at(path: Option<PathBuf>) -> (CacheFile, Vec<u8>) {
-        let mut bytes = path.as_ref().and_then(|f| std::fs::read(f).ok()).unwrap_or_default();
-        if bytes.len() < HASH || bytes.len() > MOST {
+        let small = |f: &&PathBuf| std::fs::metadata(f).is_ok_and(|m| m.len() <= (MOST + HASH) as u64);
+        let mut bytes = path.as_ref().filter(small).and_then(|f| std::fs::read(f).ok()).unwrap_or_default();
+        if bytes.len() < HASH {
             return (CacheFile { path, known: None }, vec![]);
         }
         let data = bytes.split_off(HASH);
@@ -41,7 +42,11 @@ impl CacheFile {
     /// Writes the file if there is something new; under another name first, since others may read.
     pub fn save(&self, data: &[u8]) {
         let hash = blake3::hash(data);
-        let Some(path) = self.path.as_ref().filter(|_| data.len() <= MOST && self.known != Some(hash)) else { return };
+        let Some(path) = self.path.as_ref().filter(|_| self.known != Some(hash)) else { return };
+        if data.len() > MOST {
+            let _ = std::fs::remove_file(path);
+            return;
+        }
         let part = path.with_extension(format!("{}.part", std::process::id()));
         let file = [hash.as_bytes(), data].concat();
         let folder = path.parent().map_or(Ok(()), std::fs::create_dir_all);

@@ -304,13 +304,18 @@ fn kind(properties: &vk::PhysicalDeviceProperties) -> AdapterKind {
 fn describe(instance: &Instance, physical: vk::PhysicalDevice) -> Adapter {
     let properties = properties(instance, physical);
     let name = properties.device_name_as_c_str().map_or("unnamed".into(), CStr::to_string_lossy);
-    let version = properties.api_version;
+    let (version, driver) = (properties.api_version, properties.driver_version);
+    // NVIDIA counts the parts of its versions in other bits.
+    let (major, minor, patch) = match properties.vendor_id {
+        0x10de => (driver >> 22, driver >> 14 & 0xff, driver >> 6 & 0xff),
+        _ => (vk::api_version_major(driver), vk::api_version_minor(driver), vk::api_version_patch(driver)),
+    };
     Adapter {
         name: name.into_owned(),
         api: "vulkan",
         kind: kind(&properties),
         driver: format!(
-            "Vulkan {}.{}.{}",
+            "Vulkan {}.{}.{}, driver {major}.{minor}.{patch}",
             vk::api_version_major(version),
             vk::api_version_minor(version),
             vk::api_version_patch(version)
