@@ -60,6 +60,10 @@ pub enum Error {
     Compile(#[from] StepError),
     #[error(transparent)]
     Run(#[from] RunError),
+    #[error(
+        "the model uses the parameter `{name}`, which `parameters()` of its warp or field does not list: it would stay 0"
+    )]
+    UnlistedParameter { name: String },
     #[error("`{what}` is not finite after step {step}; the last checkpoint is unharmed")]
     NotFinite { what: String, step: usize },
     #[error(

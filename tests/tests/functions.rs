@@ -1,5 +1,6 @@
 //! Derived operations: identities they obey, derivatives to second order, and special cases.
 
+use raygrad_compiler::Step;
 use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::functions::adam::{Adam, Moments, StepScalars};
 use raygrad_compiler::functions::homography::{Solver, fit_homography};
@@ -13,6 +14,7 @@ use raygrad_compiler::functions::posenc::{coarse_to_fine_weights, positional_enc
 use raygrad_compiler::functions::rigid_fit::{fit_rigid_2d, fit_rigid_3d, fit_rotation_2d, fit_translation};
 use raygrad_compiler::graph::{Axes, Axis, Shape, Tensor};
 use raygrad_compiler::reference::Array;
+use raygrad_tests::backend::{devices, reference, round, run};
 use raygrad_tests::vectors::Bound;
 use raygrad_tests::{Rng, check_gradient, check_second_order, seed, total, worst};
 
@@ -341,4 +343,70 @@ fn misfits_of_functions_name_the_call() {
         assert!(text.starts_with(&format!("{problem} at {}:{line}\n", file!())), "{text}");
         assert!(text.contains("\n  hint: "), "{text}");
     }
+}
+
+/// Near its end an alignment leaves little between a map and its homography: gradients through the fit must keep their digits
+/// where the smallest eigenvalue is below what single precision holds.
+#[test]
+fn gradients_through_nearly_exact_homographies() {
+    let (frame, point) = (Axis::new("frame", 5), Axis::new("point", 400));
+    let over = Axes::new([point.clone()]);
+    let (x, y) = (Tensor::data("x", shape(&[&point], 2)), Tensor::parameter("y", shape(&[&frame, &point], 2)));
+    let h = fit_homography(&x, &y, &over, Solver::InverseIteration, None);
+    let apart = &y - apply_homography(&h, &x);
+    let loss = (&apart * &apart).mean_all();
+    let step = Step { outputs: vec![("gradient".into(), grad(&loss, &[&y]).remove(0))], updates: vec![] };
+    for noise in [1e-2, 1e-3, 3e-4, 1e-4] {
+        let (mut points, mut images) = (vec![], vec![]);
+        for i in 0..400 {
+            points.extend([f64::from(i % 20) / 20.0 - 0.5, f64::from(i / 20) / 20.0 - 0.5]);
+        }
+        for k in 0..5 {
+            let k = f64::from(k);
+            for p in points.chunks(2) {
+                let [u, v] = [p[0], p[1]];
+                let w = 1.0 + 0.05 * k * u - 0.05 * v;
+                let moved = [((1.1 + 0.05 * k) * u + 0.1 * v + 0.2) / w, (0.9 * v - 0.05 * k * u + 0.1) / w];
+                images.push(moved[0] + noise * (5.0 * u + k).sin() * (3.0 * v - 2.0 * k).cos());
+                images.push(moved[1] + noise * (4.0 * v + k).sin());
+            }
+        }
+        let mut bound = Bound::default();
+        bound.bindings.insert("x".into(), Array::floats(x.shape(), points));
+        bound.bindings.insert("y".into(), Array::floats(y.shape(), images));
+        let bindings = round(&bound.bindings);
+        let expected = reference(&step, &bindings).remove(0);
+        for device in devices() {
+            let found = run(&device, &step, &bindings).remove(0);
+            for (k, (found, expected)) in found.chunks(800).zip(expected.chunks(800)).enumerate() {
+                let norm = |v: &mut dyn Iterator<Item = f64>| v.map(|x| x * x).sum::<f64>().sqrt();
+                let off =
+                    norm(&mut found.iter().zip(expected).map(|(a, b)| a - b)) / norm(&mut expected.iter().copied());
+                // Coordinates of size 1 have 6e-8 to go by: of a distance of 1e-4 that is a thousandth, of its gradient more.
+                let allowed = 1e-4 / noise;
+                assert!(off < allowed.clamp(0.03, 0.2), "{}: noise {noise}, frame {k}: off by {off}", device.name());
+            }
+        }
+    }
+}
+
+/// Inputs of one name are one input, also to gradients.
+#[test]
+fn gradients_of_what_was_recorded_twice() {
+    let w = || Tensor::parameter("w", shape(&[], 1));
+    let (one, two) = (w(), w());
+    let mut bound = Bound::default();
+    bound.bindings.insert("w".into(), Array::floats(one.shape(), vec![3.0]));
+    let product = &one * &two;
+    for wanted in [&one, &two, &w()] {
+        assert_eq!(bound.value(&grad(&product, &[wanted])[0]), [6.0]);
+    }
+    // Any node may be wanted, a constant divisor too.
+    let two = Tensor::scalar(2.0);
+    assert_eq!(bound.value(&grad(&(&one / &two), &[&two])[0]), [-0.75]);
+    // And the weights of the bands of an encoding, if somebody trains them.
+    let bands = Tensor::parameter("bands", shape(&[], 2));
+    bound.bindings.insert("bands".into(), Array::floats(bands.shape(), vec![0.3, 0.7]));
+    let encoded = total(&positional_encoding(&one, 2, Some(&bands)));
+    check_gradient(&encoded, &[one, bands], &bound.bindings, 1e-7, "weights of bands");
 }

@@ -114,10 +114,19 @@ fn random_numbers_are_replayable_and_distinct() {
     assert!(u.iter().all(|x| (0.0..1.0).contains(x)));
     let neighbours: f64 = u.windows(2).map(|w| (w[0] - 0.5) * (w[1] - 0.5)).sum::<f64>() / 12_000.0;
     assert!(neighbours.abs() < 4.0 / 12.0 / 12_000f64.sqrt());
-    let z = at(normal(&axes, 4, 1, &step(7)));
-    moments(&z, 0.0, 1.0);
-    let fourth: f64 = z.iter().map(|x| x.powi(4)).sum::<f64>() / 12_000.0;
-    assert!((fourth - 3.0).abs() < 0.4, "{fourth}");
+    for of in 0..8 {
+        let z = at(normal(&axes, 4, 1 + of / 4, &step(of)));
+        moments(&z, 0.0, 1.0);
+        let fourth: f64 = z.iter().map(|x| x.powi(4)).sum::<f64>() / 12_000.0;
+        assert!((fourth - 3.0).abs() < 0.4, "{fourth}");
+        // A tenth of all numbers lies beyond each decile.
+        let deciles = [-1.2816, -0.8416, -0.5244, -0.2533, 0.0, 0.2533, 0.5244, 0.8416, 1.2816];
+        for (i, limit) in deciles.into_iter().enumerate() {
+            let (below, p) = (z.iter().filter(|x| **x < limit).count() as f64, 0.1 * (i + 1) as f64);
+            let deviation = (12_000.0 * p * (1.0 - p)).sqrt();
+            assert!((below - 12_000.0 * p).abs() < 4.5 * deviation, "step {of}: {below} below {limit}");
+        }
+    }
 }
 
 fn moments(x: &[f64], mean: f64, variance: f64) {

@@ -21,15 +21,23 @@ pub fn vjp(output: &Tensor, upstream: &Tensor, wanted: &[&Tensor]) -> Vec<Tensor
         return vec![bad.clone(); wanted.len()];
     }
     let order = topological([output.clone()]);
-    let mut reaches: HashSet<u64> = wanted.iter().map(|t| t.id()).collect();
+    // Inputs of one name are one input, however often they were recorded.
+    let (mut first, mut same) = (HashMap::new(), HashMap::new());
+    for t in order.iter().chain(wanted.iter().copied()) {
+        if let Some(name) = t.input_name() {
+            same.insert(t.id(), *first.entry(name).or_insert(t.id()));
+        }
+    }
+    let id = |t: &Tensor| same.get(&t.id()).copied().unwrap_or(t.id());
+    let mut reaches: HashSet<u64> = wanted.iter().map(|t| id(t)).collect();
     for t in &order {
-        if t.inputs().iter().any(|i| reaches.contains(&i.id())) {
+        if t.inputs().iter().any(|i| reaches.contains(&id(i))) {
             reaches.insert(t.id());
         }
     }
     let mut adjoint: HashMap<u64, Tensor> = HashMap::new();
-    if reaches.contains(&output.id()) {
-        adjoint.insert(output.id(), with_source(output.source(), || fit_to(upstream.clone(), output)));
+    if reaches.contains(&id(output)) {
+        adjoint.insert(id(output), with_source(output.source(), || fit_to(upstream.clone(), output)));
     }
     for t in order.iter().rev() {
         let Some(g) = adjoint.get(&t.id()).cloned() else { continue };
@@ -43,19 +51,19 @@ pub fn vjp(output: &Tensor, upstream: &Tensor, wanted: &[&Tensor]) -> Vec<Tensor
         with_source(t.source(), || {
             for (input, dx) in t.inputs().iter().zip(gradients) {
                 let Some(dx) = dx else { continue };
-                if !reaches.contains(&input.id()) || input.dtype() == DType::U32 {
+                if !reaches.contains(&id(input)) || input.dtype() == DType::U32 {
                     continue;
                 }
                 let dx = fit_to(dx, input);
-                let total = match adjoint.get(&input.id()) {
+                let total = match adjoint.get(&id(input)) {
                     Some(sum) => sum + &dx,
                     None => dx,
                 };
-                adjoint.insert(input.id(), total);
+                adjoint.insert(id(input), total);
             }
         });
     }
-    wanted.iter().map(|w| adjoint.get(&w.id()).cloned().unwrap_or_else(|| zeros_like(w))).collect()
+    wanted.iter().map(|w| adjoint.get(&id(w)).cloned().unwrap_or_else(|| zeros_like(w))).collect()
 }
 
 /// Derivative of `output` in the direction `tangents` of `inputs`: forward mode, as the derivative of the (linear) reverse
@@ -66,7 +74,9 @@ pub fn jvp(output: &Tensor, inputs: &[&Tensor], tangents: &[&Tensor]) -> Tensor 
         let problem = format!("{} tangents for {} inputs", tangents.len(), inputs.len());
         return Tensor::misfit("jvp", &[output], problem, "give one tangent an input");
     }
-    let upstream = Tensor::input("jvp.upstream", crate::ops::input::Role::Data, output.shape().clone());
+    // It is linear in this one, which no program ever sees; derivatives of derivatives have one each.
+    let name = format!("jvp.upstream {}", output.id());
+    let upstream = Tensor::input(name, crate::ops::input::Role::Data, output.shape().clone());
     let pulled = vjp(output, &upstream, inputs);
     let paired = pulled.iter().zip(tangents).map(|(g, t)| (g * *t).sum_channels().sum_over(g.axes()));
     let total = paired.reduce(|a, b| a + b).unwrap_or_else(|| Tensor::scalar(0.0));

@@ -135,8 +135,9 @@ pub fn apply_homography(h: &Tensor, x: &Tensor) -> Tensor {
     q.slice(0..2) / (q.slice(2..3) + PROJECTION_EPSILON)
 }
 
-/// Eigenvalues below this part of the largest one are raised to it before dividing by them.
-const SINGULAR: f64 = 1e-15;
+/// Eigenvalues below this part of the largest one are raised to it before dividing by them. A matrix in single precision says
+/// nothing of smaller ones, and dividing by what rounding left of them loses the digits of everything else.
+const SINGULAR: f64 = 1e-9;
 
 /// `G^-1 b` for a symmetric positive `G`, `(n, n)` with n <= 9, and n channels, by the eigen-decomposition of G.
 ///

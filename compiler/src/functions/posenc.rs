@@ -65,7 +65,7 @@ fn encode(
         if let Err(bad) = super::expect_width(name, "band weights", w, bands) {
             return bad;
         }
-        wave = wave * w.stop_gradient().pick(&band);
+        wave = wave * w.pick(&band);
     }
     concat([x, &wave])
 }

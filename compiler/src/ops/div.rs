@@ -22,7 +22,9 @@ impl Pointwise for Div {
     fn vjp(&self, x: &[Tensor], y: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
         let (zero, one) = (Tensor::scalar(0.0), Tensor::scalar(1.0));
         if x[1].as_constant().is_some_and(|b| b.iter().all(|b| *b != 0.0)) {
-            return vec![Some(g / &x[1]), None];
+            let da = g / &x[1];
+            let db = -(&da * y);
+            return vec![Some(da), Some(db)];
         }
         let void = x[1].equal(&zero);
         let da = void.select(&zero, &(g / void.select(&one, &x[1])));

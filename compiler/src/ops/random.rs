@@ -102,7 +102,8 @@ pub fn uniform(axes: &Axes, channels: usize, stream: u32, step: &Tensor) -> Tens
 #[track_caller]
 pub fn normal(axes: &Axes, channels: usize, stream: u32, step: &Tensor) -> Tensor {
     let u = 1.0 - uniform(axes, channels, stream, step);
-    let v = uniform(axes, channels, stream ^ (1 << 31), step);
+    // Flipping a bit of the stream would not do: neighbours of one factor stay neighbours through a generator of products.
+    let v = uniform(axes, channels, stream.wrapping_mul(0x9e37_79b9).wrapping_add(0x7f4a_7c15), step);
     (u.log() * -2.0).sqrt() * (v * std::f64::consts::TAU).cos()
 }
 

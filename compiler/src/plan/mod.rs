@@ -267,9 +267,8 @@ fn assign_slots(buffers: &mut [Buffer], launches: &[Launch]) -> Vec<usize> {
             last[b] = last[b].max(at);
         }
     }
-    // What became an update in place has no launch of its own left, and needs no room.
-    let used = |b: &usize| first[*b] != usize::MAX && matches!(buffers[*b].kind, BufferKind::Temporary { .. });
-    let mut order: Vec<usize> = (0..buffers.len()).filter(used).collect();
+    let mut order: Vec<usize> =
+        (0..buffers.len()).filter(|b| matches!(buffers[*b].kind, BufferKind::Temporary { .. })).collect();
     order.sort_by_key(|b| std::cmp::Reverse(buffers[*b].shape.lanes()));
     let mut slots: Vec<(usize, Vec<(usize, usize)>)> = vec![];
     for b in order {

@@ -182,7 +182,8 @@ impl Outer {
             while channel < vectors.count {
                 let count = PANEL.min(vectors.count - channel);
                 // SAFETY: `count` channels from `channel` on and `rows` rows from `row` on lie inside the operand, and
-                // the panel has room for them, up to whole vectors: all those that are multiplied. Panel `channel / PANEL` of `g` has `height` lines of `PANEL` floats.
+                // the panel has room for them, up to whole vectors: all those that are multiplied. Panel `channel / PANEL` of
+                // `g` has `height` lines of `PANEL` floats.
                 unsafe {
                     let from = Channels { at: vectors.at.add(channel * vectors.ld + row), count, ..vectors };
                     let width = count.next_multiple_of(HALF * S::LANES);

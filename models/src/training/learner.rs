@@ -126,7 +126,15 @@ impl Learner {
     }
 
     /// Draws the initial values of all parameters.
+    ///
+    /// # Errors
+    /// If a program has a parameter that is not among them, which would stay 0 and untrained.
     pub fn fill(&mut self, parameters: &[Parameter], seed: u32) -> Result<(), Error> {
+        let listed = |name: &str| parameters.iter().any(|p| p.tensor.input_name() == Some(name));
+        let mut all = self.inputs.iter().filter(|(_, i)| i.role == Role::Parameter);
+        if let Some((name, _)) = all.find(|(name, _)| !listed(name)) {
+            return Err(Error::UnlistedParameter { name: name.clone() });
+        }
         for p in parameters {
             let Some(name) = p.tensor.input_name().filter(|n| self.has(n)) else { continue };
             self.session.set(name, &initial_values(p, seed))?;

@@ -86,7 +86,8 @@ pub trait Warp: Debug + Send + Sync {
         None
     }
 
-    /// A term that the warp adds to the loss, given the field points of its map, and the term's weight.
+    /// A term that the warp adds to the loss, given the field points of its map, and the term's weight. Of one that has axes or
+    /// channels the mean is taken.
     fn penalty(&self, _at: &Points, _code: &Tensor, _mapped: &Tensor) -> Option<(Tensor, f64)> {
         None
     }
@@ -161,7 +162,8 @@ impl Registration {
             if held { first.select(&at.position, &mapped) } else { mapped }
         };
         let (local, mapped_centers) = (map(at), centers.map(map));
-        let penalty = warp.penalty(at, code, &local);
+        let mean = |p: Tensor| if p.shape().lanes() == 1 { p } else { p.mean_all() };
+        let penalty = warp.penalty(at, code, &local).map(|(p, weight)| (mean(p), weight));
         if let Some(transform) = warp.global(&at.frame, code) {
             let transform = if held { first.select(&neutral(warp.dof()), &transform) } else { transform };
             let global = local.clone();
