@@ -1,9 +1,12 @@
 //! Derivatives of every built-in warp, first and second order, in the reference and on the devices.
 
+use raygrad::Experiment;
 use raygrad::config::{Dof, Layered, WarpSettings};
 use raygrad::testing::{check_gradients, check_gradients_on, devices};
-use raygrad::warps::{GlobalWarp, ImplicitMlpWarp, InvertibleWarp, LocalWarp, MlpWarp, Se3Field, Warp};
-use raygrad_compiler::Axis;
+use raygrad::training::Training;
+use raygrad::warps::{GlobalWarp, ImplicitMlpWarp, InvertibleWarp, LocalWarp, MlpWarp, Points, Se3Field, Warp};
+use raygrad_compiler::functions::mlp::{Init, Parameter};
+use raygrad_compiler::{Axis, Shape, Tensor};
 
 const ALL: [Dof; 5] = [Dof::Rotation, Dof::Translation, Dof::Rigid, Dof::Pose, Dof::Homography];
 
@@ -78,4 +81,42 @@ fn plain_networks() {
         check(&dof.to_string(), &ImplicitMlpWarp::new(&small(dof, &["warp.activation=silu"]), 0.3));
     }
     check("pose network", &Se3Field::new(&small(Dof::Pose, &["warp.activation=gaussian"])));
+}
+
+/// A shift by (1/2, 1/4) and a parameter that the warp may forget to list, with a term of the loss a frame and point.
+#[derive(Debug)]
+struct Shifted {
+    by: Parameter,
+    listed: bool,
+}
+
+impl Warp for Shifted {
+    fn map(&self, at: &Points, _: &Tensor) -> Tensor {
+        &at.xy + &self.by.tensor + Tensor::constant(&[0.5, 0.25])
+    }
+    fn parameters(&self) -> Vec<Parameter> {
+        if self.listed { vec![self.by.clone()] } else { vec![] }
+    }
+    fn penalty(&self, at: &Points, _: &Tensor, mapped: &Tensor) -> Option<(Tensor, f64)> {
+        Some(((mapped - &at.xy).abs() + Tensor::index(&at.frame).to_f32() * 0.0, 1.0))
+    }
+}
+
+#[test]
+fn forgotten_parameters_are_refused_and_penalties_are_means() {
+    let trainer = |listed: bool| {
+        let by = Parameter::new("shift", Shape::new(&[], 2), Init::Zero);
+        let sizes = ["data.image_size=[16,16]", "data.patch_crop=[8,8]", "data.points_per_patch=16", "run.device=cpu"];
+        let small = Experiment::preset("planar-l2g-small").and_then(|e| sizes.iter().try_fold(e, |e, s| e.set(s)));
+        small.and_then(|e| e.warp(Shifted { by, listed }).trainer())
+    };
+    let error = trainer(false).err().expect("refused").to_string();
+    assert!(error.contains("the parameter `shift`") && error.contains("`parameters()`"), "{error}");
+    let mut trainer = trainer(true).unwrap_or_else(|e| panic!("{e}"));
+    trainer.step().and_then(|()| trainer.wait()).unwrap_or_else(|e| panic!("{e}"));
+    let loss = trainer.measure().unwrap_or_else(|e| panic!("{e}")).loss;
+    // Five frames of which the first stays where it is: 0.8 of the mean of both shifts.
+    assert!((loss["penalty"] - 0.3).abs() < 1e-3, "{loss:?}");
+    let terms = loss["render"] + loss["penalty"] + loss.get("alignment").map_or(0.0, |a| 100.0 * a);
+    assert!((loss["total"] - terms).abs() < 1e-4, "{loss:?}");
 }
