@@ -5,6 +5,7 @@ pub mod check;
 pub mod forms;
 pub mod graphs;
 pub mod mistakes;
+pub mod own_op;
 pub mod plan;
 pub mod planar;
 pub mod rendering;

@@ -4,10 +4,11 @@ use raygrad_compiler::autodiff::{grad, jvp};
 use raygrad_compiler::functions::matrix::matmul;
 use raygrad_compiler::graph::{Axes, Axis, Shape, Tensor};
 use raygrad_compiler::ops::custom::custom_adjoint;
-use raygrad_compiler::ops::{Pointwise, map};
-use raygrad_compiler::reference::{Array, Bindings, EvalError, Lane, evaluate};
-use raygrad_compiler::scalar::{DType, Prim, ScalarBuilder, Val};
+use raygrad_compiler::ops::map;
+use raygrad_compiler::reference::{Array, Bindings, EvalError, evaluate};
+use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Step, Target, compile};
+use raygrad_tests::own_op;
 
 fn message(t: &Tensor) -> String {
     t.error().expect("does not fit").to_string()
@@ -131,30 +132,8 @@ fn other_arguments() {
     assert!(message(&x.pick(&[1 << 32])).contains("channels 0 to 3 exist"));
     assert!(message(&x.channel_groups(vec![vec![7]])).contains("channels 0 to 3 exist"));
     assert!(message(&x.channel_groups(vec![])).contains("no groups of channels"));
-    assert!(message(&map(Twice, &[&x, &x])).contains("2 operands for an op of 1"));
+    assert!(message(&map(own_op::Neg, &[&x, &x])).contains("2 operands for an op of 1"));
     assert!(message(&jvp(&x.sin(), &[&x], &[])).contains("0 tangents for 1 inputs"));
-}
-
-/// An op of a user's own.
-#[derive(Clone, Debug)]
-struct Twice;
-
-impl Pointwise for Twice {
-    fn name(&self) -> &'static str {
-        "twice"
-    }
-    fn operands(&self) -> &'static [Option<DType>] {
-        &[Some(DType::F32)]
-    }
-    fn eval(&self, args: &[Lane]) -> Lane {
-        Lane::F(2.0 * args[0].f())
-    }
-    fn vjp(&self, _: &[Tensor], _: &Tensor, grad: &Tensor) -> Vec<Option<Tensor>> {
-        vec![Some(grad * 2.0)]
-    }
-    fn lower(&self, b: &mut ScalarBuilder, args: &[Val]) -> Val {
-        b.emit(Prim::Add, &[args[0], args[0]])
-    }
 }
 
 #[test]

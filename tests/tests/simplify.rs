@@ -2,14 +2,13 @@
 
 use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::graph::{Axis, Shape, Tensor};
-use raygrad_compiler::ops::{Pointwise, map, registry};
-use raygrad_compiler::reference::{Array, Bindings, Lane};
-use raygrad_compiler::scalar::{DType, Prim, ScalarBuilder, Val};
+use raygrad_compiler::ops::{map, registry};
+use raygrad_compiler::reference::{Array, Bindings};
 use raygrad_compiler::simplify::simplify;
 use raygrad_compiler::{Step, Target, compile};
 use raygrad_runtime::{Device, Session};
 use raygrad_tests::backend::reference;
-use raygrad_tests::{MidGraph, total, worst};
+use raygrad_tests::{MidGraph, own_op, total, worst};
 
 #[test]
 fn every_op_and_its_gradients_keep_their_values() {
@@ -77,30 +76,8 @@ fn a_mean_counts_an_axis_once() {
 /// Two ops that print alike are two ops.
 #[test]
 fn ops_are_told_apart_by_type_and_name() {
-    mod other {
-        use super::*;
-        #[derive(Clone, Debug)]
-        pub struct Neg;
-        impl Pointwise for Neg {
-            fn name(&self) -> &'static str {
-                "twice"
-            }
-            fn operands(&self) -> &'static [Option<DType>] {
-                &[Some(DType::F32)]
-            }
-            fn eval(&self, args: &[Lane]) -> Lane {
-                Lane::F(2.0 * args[0].f())
-            }
-            fn vjp(&self, _: &[Tensor], _: &Tensor, grad: &Tensor) -> Vec<Option<Tensor>> {
-                vec![Some(grad * 2.0)]
-            }
-            fn lower(&self, b: &mut ScalarBuilder, args: &[Val]) -> Val {
-                b.emit(Prim::Add, &[args[0], args[0]])
-            }
-        }
-    }
     let x = Tensor::data("x", Shape::new(&[], 1));
-    let outputs = vec![("negative".to_string(), -&x), ("twice".to_string(), map(other::Neg, &[&x]))];
+    let outputs = vec![("negative".to_string(), -&x), ("twice".to_string(), map(own_op::Neg, &[&x]))];
     let simple = simplify(&Step { outputs, updates: vec![] });
     let x = Bindings::from([("x".to_string(), Array::floats(&Shape::new(&[], 1), vec![3.0]))]);
     assert_eq!(reference(&simple, &x), [[-3.0], [6.0]]);
