@@ -1,6 +1,7 @@
 //! Choice lane by lane, `if c != 0 { a } else { b }`.
 //!
-//! The gradient is a choice too, not a product with a mask: a NaN in the branch not taken stays out of it.
+//! The gradient is a choice too, not a product with a mask: the branch not taken gets exact zeros. What it makes of them is its
+//! own: `x log x` at 0 multiplies its zero with an infinity. Choose its operands, too, where it is not defined.
 
 use super::{Pointwise, Sample, SampleInput, map};
 use crate::graph::{Axis, Shape, Tensor};
