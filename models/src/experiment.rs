@@ -117,11 +117,8 @@ impl Experiment {
 
     /// The photo to register patches of.
     pub fn image(mut self, path: impl AsRef<Path>) -> Experiment {
-        self.layered.set_text(
-            "data.image",
-            &path.as_ref().to_string_lossy(),
-            Origin::Option("Experiment::image".into()),
-        );
+        let origin = Origin::Option("Experiment::image".into());
+        self.layered.set_text("data.image", &path.as_ref().to_string_lossy(), origin);
         self
     }
 

@@ -91,7 +91,7 @@ impl SpaceData {
             path => scene::load(Path::new(path), &options, progress)?,
         };
         let truth: Option<Vec<Pose>> = scene.train.iter().map(|v: &View| v.pose).collect();
-        let names = || scene.train.iter().map(|v| (v.name.as_str(), v.pose));
+        let names = || scene.training_poses();
         let (noise, seed) = (&settings.noise, settings.run.seed);
         let start = match (wanted.poses_in(scene.layout), noise.kind) {
             ("truth", _) => InitialPoses::Truth.draw(names(), seed)?,
@@ -137,16 +137,11 @@ impl SpaceData {
         Ok(SpaceData { size, start, truth, scene, seed })
     }
 
-    /// Names and reference poses of the training views.
-    pub fn names(&self) -> impl Iterator<Item = (&str, Option<Pose>)> {
-        self.scene.train.iter().map(|v| (v.name.as_str(), v.pose))
-    }
-
     /// Refuses a scene that is not the one that the run in a folder began with.
     pub fn check_run(&self, folder: &Path) -> Result<(), SpaceDataError> {
         let path = folder.join(START);
         if path.exists() {
-            PoseStart::check_views(&path, self.names())?;
+            PoseStart::check_views(&path, self.scene.training_poses())?;
         }
         Ok(())
     }
@@ -304,7 +299,7 @@ mod tests {
         let data = SpaceData::load(&layered, &|_, _| {}).unwrap();
         let run = tempfile::tempdir().unwrap();
         data.check_run(run.path()).unwrap();
-        std::fs::write(run.path().join(START), data.start.to_json(None, data.names())).unwrap();
+        std::fs::write(run.path().join(START), data.start.to_json(None, data.scene.training_poses())).unwrap();
         data.check_run(run.path()).unwrap();
         let other = tempfile::tempdir().unwrap();
         make_scene(other.path(), &MakeOptions { views: 12, size: 8, seed: 1 }, &|_, _| {}).unwrap();

@@ -29,7 +29,7 @@ pub struct Written {
 
 /// What the run starts from, before it begins.
 pub fn write_data(folder: &RunFolder, data: &SpaceData) -> Result<(), Error> {
-    folder.write(START, data.start.to_json(Some(data.seed), data.names()).as_bytes())?;
+    folder.write(START, data.start.to_json(Some(data.seed), data.scene.training_poses()).as_bytes())?;
     Ok(())
 }
 

@@ -210,6 +210,13 @@ pub struct Scene {
     pub notes: Vec<String>,
 }
 
+impl Scene {
+    /// Names and reference poses of the training views.
+    pub fn training_poses(&self) -> impl Iterator<Item = (&str, Option<Pose>)> {
+        self.train.iter().map(|v| (v.name.as_str(), v.pose))
+    }
+}
+
 /// What a layout says of one view before any pixel is read.
 struct Entry {
     name: String,
