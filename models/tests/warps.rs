@@ -2,11 +2,12 @@
 
 use raygrad::Experiment;
 use raygrad::config::{Dof, Layered, WarpSettings};
-use raygrad::testing::{check_gradients, check_gradients_on, devices};
+use raygrad::testing::{check_gradients, check_gradients_on, devices, kernels};
 use raygrad::training::Training;
 use raygrad::warps::{GlobalWarp, ImplicitMlpWarp, InvertibleWarp, LocalWarp, MlpWarp, Points, Se3Field, Warp};
 use raygrad_compiler::functions::mlp::{Init, Parameter};
 use raygrad_compiler::{Axis, Shape, Tensor};
+use raygrad_runtime::Device;
 
 const ALL: [Dof; 5] = [Dof::Rotation, Dof::Translation, Dof::Rigid, Dof::Pose, Dof::Homography];
 
@@ -119,4 +120,30 @@ fn forgotten_parameters_are_refused_and_penalties_are_means() {
     assert!((loss["penalty"] - 0.3).abs() < 1e-3, "{loss:?}");
     let terms = loss["render"] + loss["penalty"] + loss.get("alignment").map_or(0.0, |a| 100.0 * a);
     assert!((loss["total"] - terms).abs() < 1e-4, "{loss:?}");
+}
+
+/// A warp that gives what its function makes of the points.
+#[derive(Debug)]
+struct Mistaken(fn(&Points) -> Tensor);
+impl Warp for Mistaken {
+    fn map(&self, at: &Points, _: &Tensor) -> Tensor {
+        self.0(at)
+    }
+}
+
+/// What does not map points to points is refused with the line of the warp that made it, in tests and in training.
+#[test]
+fn maps_to_something_else_are_refused() {
+    let maps: [fn(&Points) -> Tensor; 3] =
+        [|at| at.x(), |at| at.xy.max_over(&[&at.point]), |at| &at.xy + Tensor::index(&Axis::new("other", 4)).to_f32()];
+    for map in maps {
+        let line = |message: String| {
+            assert!(message.starts_with("Warp::map: ") && message.contains("models/tests/warps.rs"), "{message}");
+        };
+        line(check_gradients_on(&Mistaken(map), &[]).expect_err("refused").to_string());
+        line(kernels(&Mistaken(map)).expect_err("refused").to_string());
+        let experiment = Experiment::preset("planar-l2g-small").expect("is there").warp(Mistaken(map));
+        let experiment = experiment.device(Device::cpu(Some(1)).expect("starts a thread"));
+        line(experiment.training().err().expect("refused").to_string());
+    }
 }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 #[cfg(feature = "gpu")]
 use {
     raygrad_compiler::cost::Rates,
-    raygrad_kernels::gpu::{Half, SOFTWARE_TILES, storages},
+    raygrad_kernels::gpu::{Half, Limits, SOFTWARE_TILES, storages},
 };
 
 /// Threads of the CPU that can be asked for.
@@ -49,6 +49,23 @@ impl Default for Forms {
 
 #[cfg(feature = "gpu")]
 impl Forms {
+    /// What to compile programs for.
+    pub fn target(self) -> Target {
+        let matrices = self.half.is_some_and(|h| h.matrices.is_some());
+        let rates = if matrices { self.rates } else { self.rates.single() };
+        Target { resident: self.resident, rates, ..Target::gpu() }
+    }
+
+    /// What kernels of a program for such a target keep to, on a device of these limits.
+    pub fn limits(self, target: &Target, of_device: Limits) -> Limits {
+        Limits { half: self.half, tiles: self.tiles, workgroups: target.rates.workgroups, ..of_device }
+    }
+
+    /// Bytes of a lane of each of a program's buffers, by id.
+    pub fn lane_bytes(self, program: &Program) -> Vec<u64> {
+        storages(program, self.half.is_some()).iter().map(|s| s.bytes()).collect()
+    }
+
     /// What suits an adapter: software has tiles of its own.
     fn of(adapter: &crate::Adapter) -> Forms {
         match adapter.kind {
@@ -259,10 +276,22 @@ impl Device {
     /// Bytes of a lane of each of a program's buffers, by id.
     pub fn lane_bytes(&self, program: &Program) -> Vec<u64> {
         #[cfg(feature = "gpu")]
-        if self.half().is_some() {
-            return storages(program, true).iter().map(|s| s.bytes()).collect();
-        }
+        return self.forms().lane_bytes(program);
+        #[cfg(not(feature = "gpu"))]
         vec![4; program.buffers.len()]
+    }
+
+    /// What kernels of a program for this device keep to; `None` on the CPU, which has no such kernels.
+    #[cfg(feature = "gpu")]
+    pub fn limits(&self, target: &Target) -> Option<Limits> {
+        let of_device = match self {
+            Device::Cpu { .. } => return None,
+            #[cfg(feature = "wgpu")]
+            Device::Wgpu { gpu, .. } => gpu.limits(),
+            #[cfg(feature = "vulkan")]
+            Device::Vulkan { gpu, .. } => gpu.limits(),
+        };
+        Some(self.forms().limits(target, of_device))
     }
 
     /// What to compile programs for.
@@ -270,11 +299,7 @@ impl Device {
         match self {
             Device::Cpu { .. } => Target::cpu(),
             #[cfg(feature = "gpu")]
-            _ => {
-                let Forms { half, resident, rates, .. } = self.forms();
-                let matrices = half.is_some_and(|h| h.matrices.is_some());
-                Target { resident, rates: if matrices { rates } else { rates.single() }, ..Target::gpu() }
-            }
+            _ => self.forms().target(),
         }
     }
 

@@ -1,9 +1,21 @@
-//! The page `explain` prints: every launch with what is fused, stored, recomputed, FLOPs and bytes.
+//! The page `explain` prints: every launch with what is fused, stored, recomputed, FLOPs and bytes, and where a device was
+//! asked, what it takes there.
 
-use super::region::{Region, RegionOp, Store};
+use super::region::{BufferId, Region, RegionOp, Store};
 use super::{BufferKind, Program};
 use std::collections::BTreeMap;
 use std::fmt;
+
+/// What a device did with the launches of a program, and what it does at best.
+#[derive(Clone, Debug)]
+pub struct Measured {
+    /// Of every launch, by the device's clock.
+    pub seconds: Vec<f64>,
+    /// 10^9 operations a second.
+    pub gflops: f64,
+    /// 10^9 bytes a second to and from memory.
+    pub gbytes: f64,
+}
 
 /// A name that says what dominates the launch: `03_frame.pixel_linear`.
 pub(super) fn launch_name(index: usize, region: &Region) -> String {
@@ -34,7 +46,7 @@ impl Program {
     }
 
     /// The same where a lane of a buffer has so many bytes.
-    pub fn launch_bytes_of(&self, index: usize, of_lane: impl Fn(super::region::BufferId) -> u64) -> u64 {
+    pub fn launch_bytes_of(&self, index: usize, of_lane: impl Fn(BufferId) -> u64) -> u64 {
         let region = &self.launches[index].region;
         let written = region.stores.iter().map(|s| s.buffer());
         region.reads().into_iter().chain(written).map(|b| of_lane(b) * self.buffer(b).shape.lanes() as u64).sum()
@@ -42,29 +54,63 @@ impl Program {
 
     /// Bytes of all buffers, temporaries of one slot counted once.
     pub fn memory_bytes(&self) -> u64 {
-        let own = self.buffers.iter().filter(|b| !matches!(b.kind, BufferKind::Temporary { .. }));
-        4 * (own.map(|b| b.shape.lanes()).sum::<usize>() + self.slots.iter().sum::<usize>()) as u64
+        self.memory_bytes_of(|_| 4)
     }
-}
 
-impl fmt::Display for Program {
-    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+    /// The same where a lane of a buffer has so many bytes.
+    fn memory_bytes_of(&self, of_lane: impl Fn(BufferId) -> u64) -> u64 {
+        let (mut own, mut slots) = (0, vec![0; self.slots.len()]);
+        for (i, b) in self.buffers.iter().enumerate() {
+            let bytes = of_lane(BufferId(i as u32)) * b.shape.lanes() as u64;
+            match b.kind {
+                BufferKind::Temporary { slot } => slots[slot] = bytes.max(slots[slot]),
+                _ => own += bytes,
+            }
+        }
+        own + slots.iter().sum::<u64>()
+    }
+
+    /// The page that explains the program where a lane of a buffer has so many bytes.
+    pub fn explained(&self, of_lane: impl Fn(BufferId) -> u64, measured: Option<&Measured>) -> String {
+        let mut text = String::new();
+        // Text takes all that is written to it.
+        let _ = self.explain(&mut text, &of_lane, measured);
+        text
+    }
+
+    fn explain(
+        &self,
+        f: &mut dyn fmt::Write,
+        of_lane: &dyn Fn(BufferId) -> u64,
+        measured: Option<&Measured>,
+    ) -> fmt::Result {
         writeln!(
             f,
             "{} launches from {} recorded ops, {:.3} GFLOP, {:.2} MB in buffers, target {:?}",
             self.launches.len(),
             self.ops,
             self.flops() as f64 * 1e-9,
-            self.memory_bytes() as f64 * 1e-6,
+            self.memory_bytes_of(of_lane) as f64 * 1e-6,
             self.target.kind,
         )?;
-        let predicted = self.predicted(|_| 4);
+        let predicted = self.predicted(of_lane);
         writeln!(f, "predicted: {:.3} ms on a device of {}", 1e3 * predicted.iter().sum::<f64>(), self.target.rates)?;
+        if let Some(Measured { seconds, gflops, gbytes }) = measured {
+            let all = 1e3 * seconds.iter().sum::<f64>();
+            writeln!(f, "measured: {all:.3} ms; at best {gflops:.0} GFLOP/s and {gbytes:.1} GB/s")?;
+        }
         for (i, launch) in self.launches.iter().enumerate() {
             let region = &launch.region;
             writeln!(f, "\n{}  over {}", launch.name, region.domain)?;
-            let (flops, bytes) = (region.flops() as f64 * 1e-6, self.launch_bytes(i) as f64 * 1e-6);
+            let (flops, bytes) = (region.flops() as f64 * 1e-6, self.launch_bytes_of(i, of_lane) as f64 * 1e-6);
             writeln!(f, "  {flops:.3} MFLOP, {bytes:.3} MB, {:.1} us predicted", 1e6 * predicted[i])?;
+            if let Some(Measured { seconds, gflops, gbytes }) = measured {
+                let time = seconds[i].max(1e-9);
+                let [flops, bytes] = [flops, bytes].map(|mega| 1e-3 * mega / time);
+                let [of_flops, of_bytes] = [flops / gflops, bytes / gbytes].map(|share| 100.0 * share);
+                write!(f, "  {:.1} us measured, ", 1e6 * seconds[i])?;
+                writeln!(f, "{flops:.1} GFLOP/s ({of_flops:.0} %), {bytes:.1} GB/s ({of_bytes:.0} %)")?;
+            }
             writeln!(f, "  fused: {}", fused(region))?;
             if launch.recomputed > 0 {
                 writeln!(f, "  recomputed: {} values of earlier launches", launch.recomputed)?;
@@ -85,9 +131,7 @@ impl fmt::Display for Program {
         }
         Ok(())
     }
-}
 
-impl Program {
     fn describe(&self, id: super::BufferId) -> String {
         let b = self.buffer(id);
         let kind = match &b.kind {
@@ -96,6 +140,12 @@ impl Program {
             BufferKind::Output => "output".into(),
         };
         format!("{} ({}, {kind})", b.label, b.shape)
+    }
+}
+
+impl fmt::Display for Program {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        self.explain(f, &|_| 4, None)
     }
 }
 

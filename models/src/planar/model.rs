@@ -88,7 +88,6 @@ impl PlanarModel {
 
     /// One training step: outputs `render`, `total`, `transform` and, where the warp has
     /// one, `alignment` and `penalty`; and an update of every trained parameter.
-    #[track_caller]
     pub fn train_step(&self) -> Step {
         let (at, target) = match self.settings.data.points_per_patch {
             Count::All => (self.all_points(), self.target()),
@@ -101,7 +100,6 @@ impl PlanarModel {
 
     /// The same losses over all pixels of the patches, with the fields of both maps: `local` and `global` points and
     /// `color`, `[frame, pixel]` each.
-    #[track_caller]
     pub fn evaluation(&self) -> Step {
         let at = self.all_points();
         let found = self.register(&at);
@@ -116,14 +114,11 @@ impl PlanarModel {
     }
 
     /// The learned picture at `pixels` points: output `color`.
-    #[track_caller]
     pub fn picture(&self, pixels: usize) -> Step {
         let view = Tensor::data(view(pixels), Shape::new(&[&Axis::new("view", pixels)], 2));
         let color = self.field.color(&view, &progress());
         Step { outputs: vec![("color".to_string(), color)], updates: vec![] }
     }
-
-    #[track_caller]
     fn losses(&self, at: &Points, target: &Tensor) -> (Registration, Tensor) {
         let found = self.register(at);
         let color = self.field.color(&found.local, &progress());
@@ -132,7 +127,6 @@ impl PlanarModel {
     }
 
     /// A weight of zero removes the alignment term: its gradient is not even computed.
-    #[track_caller]
     fn total(&self, found: &Registration, render: &Tensor) -> Tensor {
         let weight = self.settings.loss.alignment;
         let aligned = match &found.residual {
@@ -144,27 +138,20 @@ impl PlanarModel {
             _ => aligned,
         }
     }
-
-    #[track_caller]
     fn register(&self, at: &Points) -> Registration {
         let none = Tensor::scalar(0.0);
         let code = self.code.as_ref().map_or(&none, |c| &c.tensor);
         Registration::new(&*self.warp, at, None, code, self.settings.warp.fix_first)
     }
-
-    #[track_caller]
     fn all_points(&self) -> Points {
         let xy = Tensor::data(GRID, Shape::new(&[&self.pixel], 2));
         Points::planar(self.frame.clone(), self.pixel.clone(), xy)
     }
-
-    #[track_caller]
     fn target(&self) -> Tensor {
         Tensor::data(TARGET, Shape::new(&[&self.frame, &self.pixel], 3))
     }
 
     /// `points` pixels a patch: the patch is cut into that many runs of pixels, and one is drawn from each.
-    #[track_caller]
     fn drawn_points(&self, points: usize) -> (Points, Tensor) {
         let point = Axis::new("point", points);
         let seed = Tensor::data(SEED, Shape::new(&[], 1).with_dtype(DType::U32));
@@ -180,7 +167,6 @@ impl PlanarModel {
     }
 
     /// Adam on every parameter; where codes of zeros are the identity, the gauge is held by them.
-    #[track_caller]
     fn updates(&self, total: &Tensor) -> Vec<(Tensor, Tensor)> {
         let warp: Vec<Parameter> = self.warp_parameters().collect();
         let mut updates = optimise::updates(total, &self.field.parameters(), &warp, self.scales_loss);
@@ -191,8 +177,6 @@ impl PlanarModel {
         updates
     }
 }
-
-#[track_caller]
 fn progress() -> Tensor {
     Tensor::input(PROGRESS, Role::PerStep, Shape::new(&[], 1))
 }

@@ -137,7 +137,6 @@ impl RadianceModel {
 
     /// One training step: outputs `render`, `total`, `found`, with a fine field `render_fine`, and, where the warp has one,
     /// `alignment` and `penalty`; and an update of every trained parameter.
-    #[track_caller]
     pub fn train_step(&self) -> Step {
         let ray = Axis::new("ray", self.rays_per_view());
         let step = seeded_step();
@@ -152,7 +151,6 @@ impl RadianceModel {
 
     /// One training step on the pixels `index` along `ray`, and along the frames if theirs differ; `colors` are theirs,
     /// `[frame, ray] x 3`.
-    #[track_caller]
     pub fn step_at(&self, ray: &Axis, index: &Tensor, colors: &Tensor) -> Step {
         let intrinsics = Tensor::data(INTRINSICS, Shape::new(&[&self.frame], 4));
         let rough = Tensor::input(POSES, Role::State, Shape::new(&[&self.frame], (3, 4)));
@@ -195,7 +193,6 @@ impl RadianceModel {
     }
 
     /// Part of a view, `pixels` of them from [`VIEW_FIRST`] on: outputs `color`, `depth` and `opacity`.
-    #[track_caller]
     pub fn view(&self, pixels: usize) -> Step {
         let point = Axis::new("view", pixels);
         let first = Tensor::per_step(VIEW_FIRST, Shape::new(&[], 1).with_dtype(DType::U32));
@@ -208,7 +205,6 @@ impl RadianceModel {
 
     /// One step of the refinement of a view's pose against its image, `P Exp(twist)` with the field as it is: Adam on the
     /// twist alone. Output `render`, with a fine field the sum of both pictures' terms.
-    #[track_caller]
     pub fn refinement(&self) -> Step {
         let twist = Tensor::input(TWIST, Role::State, Shape::new(&[], 6));
         let render = self.photo_error(&compose_poses(&view_pose(), &se3_exp(&twist)));
@@ -219,13 +215,11 @@ impl RadianceModel {
     }
 
     /// How far the model's picture of a view is from its image, at random pixels: output `render` as of [`Self::refinement`].
-    #[track_caller]
     pub fn comparison(&self) -> Step {
         Step { outputs: vec![("render".to_string(), self.photo_error(&view_pose()))], updates: vec![] }
     }
 
     /// Mean squared error against [`VIEW_IMAGE`] of random pixels seen from `pose`.
-    #[track_caller]
     fn photo_error(&self, pose: &Tensor) -> Tensor {
         let point = Axis::new("view", self.train.rays.min(self.size.pixels()));
         let draw = random::uniform(&Axes::new([point.clone()]), 1, PIXELS, &seeded_step());
@@ -238,19 +232,14 @@ impl RadianceModel {
     }
 
     /// The field at `count` points of the learned world, [`DENSITY_POINTS`]: output `density`.
-    #[track_caller]
     pub fn density(&self, count: usize) -> Step {
         let points = Tensor::data(DENSITY_POINTS, Shape::new(&[&Axis::new("place", count)], 3));
         Step { outputs: vec![("density".to_string(), self.rendering.density_at(&points))], updates: vec![] }
     }
-
-    #[track_caller]
     fn view_rays(&self, point: &Axis, index: &Tensor, pose: &Tensor) -> Rays {
         let cameras = Cameras::new(&self.frame, point, index, self.size, &view_intrinsics(), pose);
         Rays::through(&cameras.centers.position, &cameras.pixels.position)
     }
-
-    #[track_caller]
     fn view_range(&self) -> (Tensor, Tensor) {
         match self.train.depth {
             DepthSettings::Auto => {
@@ -260,15 +249,12 @@ impl RadianceModel {
             _ => self.fixed_range(),
         }
     }
-
-    #[track_caller]
     fn fixed_range(&self) -> (Tensor, Tensor) {
         let [near, far] = self.train.range;
         (Tensor::scalar(near), Tensor::scalar(far))
     }
 
     /// What the rays of a rendered view see.
-    #[track_caller]
     fn see(&self, rays: &Rays, axes: &Axes, purpose: Purpose) -> Seen {
         self.rendering.render(rays, &view_intrinsics(), &self.view_range(), axes, purpose)
     }
@@ -283,7 +269,6 @@ struct Pictures {
 }
 
 impl Pictures {
-    #[track_caller]
     fn new(seen: &Seen, colors: &Tensor) -> Pictures {
         let render = mean_squared_error(&seen.coarse.color, colors);
         let fine = seen.fine.as_ref().map(|f| mean_squared_error(&f.color, colors));
@@ -298,7 +283,6 @@ pub fn packed(view: &View) -> impl Iterator<Item = u32> + '_ {
 }
 
 /// Colours of packed pixels on white, as [`View::rgb`].
-#[track_caller]
 fn on_white(pixels: &Tensor) -> Tensor {
     let byte =
         |i: u32| pixels.shift_right(&Tensor::integers(&[8 * i])).bit_and(&Tensor::integers(&[255])).to_f32() / 255.0;
@@ -311,19 +295,14 @@ pub fn nothing_found(views: usize) -> Vec<f32> {
     let one = [1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1., 0.];
     (0..views).flat_map(|_| one).collect()
 }
-
-#[track_caller]
 fn view_pose() -> Tensor {
     Tensor::per_step(VIEW_POSE, Shape::new(&[], (3, 4)))
 }
-
-#[track_caller]
 fn view_intrinsics() -> Tensor {
     Tensor::per_step(VIEW_INTRINSICS, Shape::new(&[], 4))
 }
 
 /// The number of the step, and which run it belongs to.
-#[track_caller]
 pub(super) fn seeded_step() -> Tensor {
     let seed = Tensor::data(SEED, Shape::new(&[], 1).with_dtype(DType::U32));
     Tensor::per_step(STEP, Shape::new(&[], 1).with_dtype(DType::U32)).wrapping_add(&seed)

@@ -33,7 +33,6 @@ pub struct Cameras {
 impl Cameras {
     /// `index`: pixel numbers (row by row) along `point`. `intrinsics`: fx, fy, cx, cy; `pose`: `(3, 4)`, along `frame` where
     /// there are several cameras.
-    #[track_caller]
     pub fn new(
         frame: &Axis,
         point: &Axis,
@@ -67,17 +66,12 @@ pub struct Rays {
 
 impl Rays {
     /// From mapped centres through mapped pixels.
-    #[track_caller]
     pub fn through(center: &Tensor, pixel: &Tensor) -> Rays {
         Rays { origin: center.clone(), direction: pixel - center }
     }
-
-    #[track_caller]
     pub fn length(&self) -> Tensor {
         (&self.direction * &self.direction).sum_channels().sqrt()
     }
-
-    #[track_caller]
     pub fn at(&self, depth: &Tensor) -> Tensor {
         &self.origin + depth * &self.direction
     }
@@ -100,7 +94,6 @@ const FARTHEST: f64 = 1e-6;
 /// with depths from 0 (the plane) to 1 (infinity).
 impl Rays {
     /// The same rays in normalised device coordinates of a lens (fx, fy, cx, cy).
-    #[track_caller]
     pub fn to_ndc(&self, intrinsics: &Tensor) -> Rays {
         let scale = intrinsics.slice(0..2) / intrinsics.slice(2..4);
         let slope = self.direction.slice(0..2) / self.direction.ch(2);
@@ -110,7 +103,6 @@ impl Rays {
     }
 
     /// The depth along these rays of what lies at `depth` along the same rays in normalised device coordinates.
-    #[track_caller]
     pub fn depth_of_ndc(&self, depth: &Tensor) -> Tensor {
         let z = NEAR / (1.0 - depth).max(&Tensor::scalar(FARTHEST));
         (z - self.origin.ch(2)) / self.direction.ch(2)
@@ -123,7 +115,6 @@ pub const FAR_PART: f64 = 0.75;
 
 /// Near and far from the spread of cameras with `poses` along `frame`: a quarter and three quarters of the largest distance
 /// between two of their centres. Nothing is differentiated through them.
-#[track_caller]
 pub fn range_of(poses: &Tensor, frame: &Axis) -> (Tensor, Tensor) {
     let (rotation, translation) = split_pose(poses);
     let center = -apply(&rotation.transpose(), &translation);

@@ -78,14 +78,12 @@ impl Rendering {
     }
 
     /// The density of the field that is shown, at points of the learned world.
-    #[track_caller]
     pub fn density_at(&self, points: &Tensor) -> Tensor {
         self.fine.as_ref().unwrap_or(&self.coarse).density_at(points, &progress())
     }
 
     /// Renders rays along `axes` of a camera with `intrinsics` (fx, fy, cx, cy) between the depths `near` and `far`. Depths
     /// come in the unit of the rays' world, also where the fields live in normalised device coordinates.
-    #[track_caller]
     pub fn render(
         &self,
         rays: &Rays,
@@ -130,8 +128,6 @@ impl Rendering {
         }
         Seen { coarse, fine }
     }
-
-    #[track_caller]
     fn through(
         &self,
         field: &RadianceField,
@@ -152,8 +148,6 @@ impl Rendering {
         seen
     }
 }
-
-#[track_caller]
 fn progress() -> Tensor {
     Tensor::per_step(PROGRESS, Shape::new(&[], 1))
 }

@@ -18,7 +18,6 @@ const MANY: usize = 1024;
 const FEW: usize = 64;
 
 /// Sums of every `count`th channel.
-#[track_caller]
 fn grouped(x: &Tensor, count: usize) -> Tensor {
     let all = x.channels().count() as u32;
     x.channel_groups((0..count as u32).map(|first| (first..all).step_by(count).collect()).collect())
@@ -35,7 +34,6 @@ pub struct LossScale {
 }
 
 impl LossScale {
-    #[track_caller]
     pub fn new() -> LossScale {
         let state = |name| Tensor::input(name, Role::State, Shape::new(&[], 1));
         let [held, steps] = STATES.map(state);
@@ -44,13 +42,11 @@ impl LossScale {
     }
 
     /// What to differentiate.
-    #[track_caller]
     pub fn scaled(&self, loss: &Tensor) -> Tensor {
         loss * &self.scale
     }
 
     /// A parameter's gradient from that of the scaled loss.
-    #[track_caller]
     pub fn unscaled(&self, gradient: &Tensor) -> Tensor {
         gradient / &self.scale
     }
@@ -58,7 +54,6 @@ impl LossScale {
     /// Whether all gradients are finite: a mask without axes. A sum of squares beyond all floats counts as infinite.
     ///
     /// Channels are summed in groups, because a GPU takes one invocation a sum.
-    #[track_caller]
     pub fn finite(gradients: &[Tensor]) -> Tensor {
         let squares = gradients.iter().map(|g| {
             let square = g * g;
@@ -72,7 +67,6 @@ impl LossScale {
     }
 
     /// The scale's own updates after a step.
-    #[track_caller]
     pub fn updates(self, finite: &Tensor) -> Vec<(Tensor, Tensor)> {
         let zero = Tensor::scalar(0.0);
         let counted = finite.select(&(&self.steps + 1.0), &zero);

@@ -68,7 +68,6 @@ pub fn scales_loss(precision: Precision, target: TargetKind) -> bool {
 
 /// What an Adam step makes of some parameters and their moments. From a scaled loss also the scale, and a mask that says
 /// whether all gradients were finite; where they were not, nothing changes.
-#[track_caller]
 fn adam(loss: &Tensor, all: &[(&Tensor, &StepScalars)], scaled: bool) -> (Updates, Option<(LossScale, Tensor)>) {
     let wanted: Vec<&Tensor> = all.iter().map(|(p, _)| *p).collect();
     let scale = scaled.then(LossScale::new);
@@ -89,14 +88,12 @@ fn adam(loss: &Tensor, all: &[(&Tensor, &StepScalars)], scaled: bool) -> (Update
 
 /// What an Adam step makes of one parameter and its moments, from a loss that is `scaled` as the last training step would
 /// have it.
-#[track_caller]
 pub fn update_of(loss: &Tensor, parameter: &Tensor, scalars: &StepScalars, scaled: bool) -> Updates {
     adam(loss, &[(parameter, scalars)], scaled).0
 }
 
 /// What an Adam step makes of every trained parameter and its moments; field and warp have learning rates of their own. The
 /// loss may be `scaled`.
-#[track_caller]
 pub fn updates(total: &Tensor, field: &[Parameter], warp: &[Parameter], scaled: bool) -> Updates {
     let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
     let scalars = |lr| StepScalars { lr: scalar(lr), bias1: scalar(BIAS1), bias2: scalar(BIAS2) };
@@ -111,7 +108,6 @@ pub fn updates(total: &Tensor, field: &[Parameter], warp: &[Parameter], scaled: 
 }
 
 /// Makes the first frame's row of `parameter` zero after the step: it fixes the gauge. Its moments go on.
-#[track_caller]
 pub fn hold_first(updates: &mut [(Tensor, Tensor)], parameter: &Tensor, frame: &Axis) {
     let first = Tensor::index(frame).equal(&Tensor::integers(&[0]));
     for (_, value) in updates.iter_mut().filter(|(input, _)| input.id() == parameter.id()) {

@@ -22,7 +22,8 @@ pub use plain::{ImplicitMlpWarp, MlpWarp, Se3Field};
 use crate::config::{Dof, Method, Settings, Solver};
 use raygrad_compiler::functions::matrix::identity;
 use raygrad_compiler::functions::mlp::{Init, Parameter};
-use raygrad_compiler::{Axis, Shape, Tensor};
+use raygrad_compiler::graph::with_source;
+use raygrad_compiler::{Axes, Axis, Shape, Tensor};
 use std::fmt::Debug;
 use std::sync::Arc;
 
@@ -152,13 +153,12 @@ pub struct Registration {
 
 impl Registration {
     /// Applies `warp` to pixels `at` and, in 3D, to the camera centres of the same rays; `pinned` says whether the first
-    /// frame is the gauge.
-    #[track_caller]
+    /// frame is the gauge. Field points that do not fit carry an error with the warp's own line.
     pub fn new(warp: &dyn Warp, at: &Points, centers: Option<&Points>, code: &Tensor, pinned: bool) -> Registration {
         let first = Tensor::index(&at.frame).equal(&Tensor::integers(&[0]));
         let held = pinned && !warp.zero_code_is_identity();
         let map = |at: &Points| {
-            let mapped = warp.map(at, code);
+            let mapped = fitting(at, warp.map(at, code));
             if held { first.select(&at.position, &mapped) } else { mapped }
         };
         let (local, mapped_centers) = (map(at), centers.map(map));
@@ -180,6 +180,20 @@ impl Registration {
         }
         Registration { local, transform, global, centers: mapped_centers, residual: Some(residual), penalty }
     }
+}
+
+/// What a warp made of points, if these are points again: as many coordinates, along the axes of the points and no others.
+fn fitting(at: &Points, mapped: Tensor) -> Tensor {
+    let own = at.position.axes();
+    let all = own.union(&Axes::new([at.frame.clone(), at.point.clone()]));
+    let fits = own.is_subset(mapped.axes()) && mapped.axes().is_subset(&all) && mapped.width() == at.position.width();
+    if fits || mapped.error().is_some() {
+        return mapped;
+    }
+    let (width, axes) = (at.position.width(), own);
+    let problem = "the points that are mapped (operand 1) do not become points (operand 2)";
+    let hint = format!("a map gives {width} channels along {axes} and, where frames differ, [{}]", at.frame);
+    with_source(mapped.source(), || Tensor::misfit("Warp::map", &[&at.position, &mapped], problem, hint))
 }
 
 /// The transform that moves nothing.

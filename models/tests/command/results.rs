@@ -1,6 +1,6 @@
 //! The command from outside: what a run leaves behind, and that it can be stopped and resumed bit by bit.
 
-use crate::workplace::{Workplace, names, stderr};
+use crate::workplace::{Workplace, mentions, names, stderr};
 use serde_json::Value;
 use std::io::{BufRead, BufReader};
 use std::process::Stdio;
@@ -162,6 +162,8 @@ fn bench_prints_the_numbers_of_a_step() {
     assert!(of_launches > launches.len() && of_launches.is_multiple_of(launches.len()), "{events:?}");
     let text = w.succeed(&["bench", "tiny.toml", "--steps", "1", "--launches"]);
     assert!(launches.iter().all(|l| text.contains(l["name"].as_str().unwrap())) && text.contains("at best"), "{text}");
+    let refused = w.run(&["bench", "tiny.toml", "--trace", "nowhere/trace.json"]);
+    assert_eq!(refused.status.code(), Some(2), "{refused:?}");
 }
 
 #[cfg(feature = "gpu")]
@@ -180,4 +182,19 @@ fn explain_prints_the_plan_and_writes_artefacts() {
         let files = names(&w.path(emit));
         assert!(files.len() > 3 && files.iter().all(|f| f.ends_with(ending)), "{files:?}");
     }
+    // Of other kernels that were there before nothing stays; of halves they say so.
+    std::fs::write(w.path("wgsl").join("999_other.wgsl"), "").unwrap();
+    std::fs::write(w.path("wgsl").join("notes.wgsl"), "").unwrap();
+    let emit = ["explain", "tiny.toml", "--emit", "wgsl", "--precision", "mixed", "--set", "field.layers=[32,32]"];
+    w.succeed(&[&emit[..], &["--out", "wgsl"]].concat());
+    let files = names(&w.path("wgsl"));
+    assert!(!files.contains(&"999_other.wgsl".into()) && files.contains(&"notes.wgsl".into()), "{files:?}");
+    let text = |f: &String| std::fs::read_to_string(w.path("wgsl").join(f)).unwrap();
+    assert!(files.iter().any(|f| text(f).contains("enable f16;")), "{files:?}");
+    // A device that is named is asked what every launch takes.
+    let page = w.succeed(&["explain", "tiny.toml", "--device", "cpu"]);
+    let launches = page.matches(" us predicted").count();
+    assert!(launches > 0 && page.matches(" us measured, ").count() == launches && page.contains("at best"), "{page}");
+    assert_eq!(w.run(&["explain", "tiny.toml", "--device", "cpu", "--target", "gpu"]).status.code(), Some(2));
+    mentions(&w.refuse(&["explain", "tiny.toml", "--device", "cpu", "--emit", "wgsl"]), &["CPU", "--device"]);
 }

@@ -191,9 +191,7 @@ impl<A: Api> Executor for GpuExecutor<A> {
         if program.target.kind != TargetKind::Gpu {
             return Err(RunError::Target(program.target.kind));
         }
-        let Forms { half, tiles, .. } = self.forms;
-        let workgroups = program.target.rates.workgroups;
-        let limits = Limits { half, tiles, workgroups, ..self.api.limits() };
+        let limits = self.forms.limits(&program.target, self.api.limits());
         let mut inputs = self.inputs.clone();
         let lowered = lower(&program, &mut inputs, &limits).map_err(|e| self.lower_error(e))?;
         let before = self.arenas.len();

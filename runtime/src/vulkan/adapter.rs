@@ -161,7 +161,7 @@ impl Gpu {
         &self.adapter
     }
 
-    pub(super) fn limits(&self) -> Limits {
+    pub(crate) fn limits(&self) -> Limits {
         self.limits
     }
 

@@ -118,7 +118,7 @@ impl Gpu {
         self.cache.as_ref().map(|(_, cache)| cache)
     }
 
-    pub(super) fn limits(&self) -> Limits {
+    pub(crate) fn limits(&self) -> Limits {
         self.limits
     }
 

@@ -1,15 +1,19 @@
 //! `raygrad bench`: how long a training step takes, launch by launch, against what the device could do at best.
 
+use crate::launches::{medians, profile, warm};
 use crate::{Choice, print};
 use clap::Args;
-use raygrad::config::{ConfigError, Count};
+use raygrad::config::ConfigError;
 use raygrad::report::median;
+use raygrad::run::files::WriteError;
 use raygrad::training::Training;
 use raygrad_compiler::Program;
 use raygrad_runtime::Device;
 use serde::Serialize;
 use serde_json::json;
-use std::fmt::Write;
+use std::fmt::Write as _;
+use std::fs::File;
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
@@ -75,31 +79,24 @@ struct Launch {
     predicted_seconds: f64,
 }
 
-const WARM_UP: usize = 3;
 const SECONDS: f64 = 5.0;
 const LEAST: usize = 10;
 /// Steps that the host runs ahead.
 const AHEAD: usize = 2;
-/// Steps whose launches are timed.
-const PROFILED: usize = 7;
+/// How often the host's time is taken.
+const HOST_STEPS: usize = 7;
 
 pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
     let mut experiment = args.choice.experiment()?;
-    if let Some(scene) = &mut experiment.layered.settings.scene {
-        // A step needs the training views alone.
-        (scene.val_views, scene.test_views) = (Count::Of(0), Count::Of(0));
-    }
-    let mut trainer = experiment.training()?;
-    let settings = &experiment.layered.settings;
-    let threads = settings.run.threads.of(std::thread::available_parallelism().map_or(1, usize::from));
     if args.steps == Some(0) {
         let refused: ConfigError = experiment.layered.refuse("--steps", "expected 1 or more, found 0");
         return Err(raygrad::Error::from(refused).into());
     }
-    for _ in 0..WARM_UP {
-        trainer.step()?;
-        trainer.wait()?;
-    }
+    // A file that cannot be written is found out before the steps.
+    let trace = args.trace.as_deref().map(trace_file).transpose()?;
+    let mut trainer = warm(&mut experiment)?;
+    let settings = &experiment.layered.settings;
+    let threads = settings.run.threads.of(std::thread::available_parallelism().map_or(1, usize::from));
     let device = trainer.learner().device().clone();
     // The peak is looked at before the steps and after: the clock may change in between.
     let before = device.peak_gflops()?;
@@ -121,7 +118,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
     let peak_gbytes = if args.launches { Some(device.peak_gbytes()?) } else { None };
     let program = trainer.learner().program(trainer.training_program());
     let of_lanes = device.lane_bytes(program);
-    if let Some(file) = &args.trace {
+    if let Some(file) = trace {
         write_trace(file, program, &of_lanes, &profiled)?;
     }
     let seconds = median(&times);
@@ -170,7 +167,7 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
 /// Seconds that the host is busy with a step, a few of which it may leave to the device without waiting.
 fn host_seconds(trainer: &mut dyn Training) -> anyhow::Result<f64> {
     let mut times = vec![];
-    for _ in 0..PROFILED {
+    for _ in 0..HOST_STEPS {
         for _ in 0..AHEAD {
             let begun = Instant::now();
             trainer.step()?;
@@ -181,26 +178,11 @@ fn host_seconds(trainer: &mut dyn Training) -> anyhow::Result<f64> {
     Ok(median(&times))
 }
 
-/// Seconds of every launch of some steps.
-fn profile(trainer: &mut dyn Training) -> anyhow::Result<Vec<Vec<f64>>> {
-    let program = trainer.training_program();
-    let learner = trainer.learner_mut();
-    let mut steps = vec![];
-    // The first one may have to make what reads the clock.
-    for _ in 0..=PROFILED {
-        match learner.profile(program)? {
-            Some(seconds) => steps.push(seconds),
-            None => anyhow::bail!("{} has no clock for launches", learner.device_name()),
-        }
-    }
-    steps.remove(0);
-    Ok(steps)
-}
-
 fn launches(program: &Program, of_lanes: &[u64], predicted: &[f64], profiled: &[Vec<f64>]) -> Vec<Launch> {
+    let seconds = medians(profiled);
     let one = |(i, launch): (usize, &raygrad_compiler::plan::Launch)| Launch {
         name: launch.name.clone(),
-        seconds: median(&profiled.iter().map(|step| step[i]).collect::<Vec<_>>()),
+        seconds: seconds[i],
         gflop: launch.region.flops() as f64 * 1e-9,
         gbytes: program.launch_bytes_of(i, |b| of_lanes[b.0 as usize]) as f64 * 1e-9,
         predicted_seconds: predicted[i],
@@ -244,8 +226,19 @@ fn write_launches(text: &mut String, launches: &[Launch], peak: f64, peak_gbytes
     )
 }
 
+/// A new file for a trace.
+fn trace_file(path: &Path) -> anyhow::Result<(&Path, File)> {
+    let file = File::create(path).map_err(|source| WriteError { path: path.to_path_buf(), source });
+    Ok((path, file.map_err(raygrad::Error::from)?))
+}
+
 /// Complete events of the trace event format (times in microseconds), the steps one after the other.
-fn write_trace(file: &Path, program: &Program, of_lanes: &[u64], profiled: &[Vec<f64>]) -> anyhow::Result<()> {
+fn write_trace(
+    (path, mut file): (&Path, File),
+    program: &Program,
+    of_lanes: &[u64],
+    profiled: &[Vec<f64>],
+) -> anyhow::Result<()> {
     let mut events = vec![];
     let mut at = 0.0;
     for (number, step) in profiled.iter().enumerate() {
@@ -263,7 +256,8 @@ fn write_trace(file: &Path, program: &Program, of_lanes: &[u64], profiled: &[Vec
         }
     }
     let text = serde_json::to_string(&json!({ "traceEvents": events, "displayTimeUnit": "ms" }))?;
-    std::fs::write(file, text).map_err(|e| anyhow::anyhow!("cannot write {}: {e}", file.display()))
+    let written = file.write_all(text.as_bytes()).map_err(|source| WriteError { path: path.to_path_buf(), source });
+    Ok(written.map_err(raygrad::Error::from)?)
 }
 
 /// Largest resident set of this process so far, in 10^6 bytes; 0 where the system does not tell.

@@ -1,20 +1,29 @@
-//! `raygrad explain`: what an experiment compiles to. Needs no device.
+//! `raygrad explain`: what an experiment compiles to. With `--device` what it compiles to there, and what every launch takes;
+//! otherwise no device is asked.
 
+use crate::launches::{medians, profile, warm};
 use crate::{Choice, output_folder, print};
 use clap::{Args, ValueEnum};
 use raygrad::Experiment;
 use raygrad::planar::{PlanarData, PlanarModel};
 use raygrad::radiance::data::SpaceDataError;
 use raygrad::radiance::{RadianceModel, SpaceData};
-use raygrad::run::files::write_atomically;
+use raygrad::run::files::{WriteError, write_atomically};
 use raygrad::training::learner::{compiled, untried};
 use raygrad::warps;
 use raygrad_compiler::fuse::TargetKind;
 use raygrad_compiler::graph::topological;
+use raygrad_compiler::plan::explain::Measured;
 use raygrad_compiler::{Program, Step, Target};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
+#[cfg(feature = "gpu")]
+use {
+    raygrad::config::Precision,
+    raygrad_kernels::gpu::{Half, Inputs, Limits, Matrices, lower},
+    raygrad_runtime::Forms,
+};
 
 #[derive(Args)]
 pub struct ExplainArgs {
@@ -26,8 +35,9 @@ pub struct ExplainArgs {
     /// Folder for the artefacts, a file a kernel; without it they are printed.
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Which kind of device to plan for.
-    #[arg(long, value_enum, default_value = "cpu")]
+    /// Which kind of device to plan for, where none is named; with `--device` the plan is for that one, and a few steps there
+    /// say how long every launch takes.
+    #[arg(long, value_enum, default_value = "cpu", conflicts_with = "device")]
     target: TargetChoice,
     /// Print how long each stage takes.
     #[arg(long)]
@@ -53,22 +63,26 @@ enum TargetChoice {
 }
 
 pub fn run(args: &ExplainArgs) -> anyhow::Result<ExitCode> {
-    let experiment = args.choice.experiment()?;
+    let mut experiment = args.choice.experiment()?;
     experiment.layered.validate().map_err(raygrad::Error::from)?;
-    let gpu = args.target == TargetChoice::Gpu || matches!(args.emit, Some(Artefact::Wgsl | Artefact::Spirv));
-    let target = if gpu { Target::gpu() } else { Target::cpu() };
-    let (step, recorded) = record(&experiment, target.kind)?;
-    let networks = experiment.layered.settings.run.networks;
-    let program = compiled(&step, &target, networks, |both| Ok(untried(both, |p| p.predicted(|_| 4))))?;
+    let (plan, step, recorded) = match args.choice.device {
+        Some(_) => on_device(&mut experiment, args.emit)?,
+        None => untested(&experiment, args)?,
+    };
     let files = match args.emit {
-        None => vec![("explain.txt".to_string(), program.to_string().into_bytes())],
+        None => {
+            let of_lanes = &plan.of_lanes;
+            let page = plan.program.explained(|b| of_lanes[b.0 as usize], plan.measured.as_ref());
+            vec![("explain.txt".to_string(), page.into_bytes())]
+        }
         Some(Artefact::Graph) => vec![("graph.txt".to_string(), graph(&step).into_bytes())],
-        Some(Artefact::Plan) => vec![("plan.txt".to_string(), format!("{program:#?}\n").into_bytes())],
-        Some(artefact @ (Artefact::Wgsl | Artefact::Spirv)) => kernels(&program, artefact)?,
+        Some(Artefact::Plan) => vec![("plan.txt".to_string(), format!("{:#?}\n", plan.program).into_bytes())],
+        Some(artefact @ (Artefact::Wgsl | Artefact::Spirv)) => kernels(&experiment, &plan, artefact)?,
     };
     match &args.out {
         Some(folder) => {
             output_folder(folder)?;
+            remove_kernels(folder)?;
             for (name, bytes) in &files {
                 write_atomically(&folder.join(name), bytes).map_err(raygrad::Error::from)?;
             }
@@ -84,9 +98,78 @@ pub fn run(args: &ExplainArgs) -> anyhow::Result<ExitCode> {
         }
     }
     if args.timing {
-        timing(recorded, &program)?;
+        timing(recorded, &plan.program)?;
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// The program of a training step, for a device or a kind of device.
+struct Plan {
+    program: Program,
+    /// Bytes of a lane of each buffer, by id.
+    of_lanes: Vec<u64>,
+    measured: Option<Measured>,
+    /// What kernels keep to; none on the CPU.
+    #[cfg(feature = "gpu")]
+    limits: Option<Limits>,
+}
+
+/// What the device of an experiment runs, and how fast unless something else is asked for.
+fn on_device(experiment: &mut Experiment, emit: Option<Artefact>) -> anyhow::Result<(Plan, Step, Duration)> {
+    let mut trainer = warm(experiment)?;
+    let device = trainer.learner().device().clone();
+    let program = trainer.learner().program(trainer.training_program()).clone();
+    let measured = match emit {
+        Some(_) => None,
+        None => {
+            let seconds = medians(&profile(&mut *trainer)?);
+            let gflops = device.peak_matrix_gflops()?.map_or_else(|| device.peak_gflops(), Ok)?;
+            Some(Measured { seconds, gflops, gbytes: device.peak_gbytes()? })
+        }
+    };
+    let of_lanes = device.lane_bytes(&program);
+    let (step, recorded) = record(experiment, program.target.kind)?;
+    #[cfg(feature = "gpu")]
+    let limits = device.limits(&program.target);
+    let plan = Plan {
+        program,
+        of_lanes,
+        measured,
+        #[cfg(feature = "gpu")]
+        limits,
+    };
+    Ok((plan, step, recorded))
+}
+
+/// What a device of some kind would run, none being asked.
+#[cfg(feature = "gpu")]
+fn untested(experiment: &Experiment, args: &ExplainArgs) -> anyhow::Result<(Plan, Step, Duration)> {
+    let gpu = args.target == TargetChoice::Gpu || matches!(args.emit, Some(Artefact::Wgsl | Artefact::Spirv));
+    let run = &experiment.layered.settings.run;
+    // A large GPU multiplies matrices of 16 x 16 halves.
+    let half = (run.precision == Precision::Mixed).then(|| Half { matrices: Matrices::new(16, 32) });
+    let forms = Forms { half, ..Forms::default() };
+    let target = if gpu { forms.target() } else { Target::cpu() };
+    let (step, recorded) = record(experiment, target.kind)?;
+    let of_lanes = |program: &Program| if gpu { forms.lane_bytes(program) } else { vec![4; program.buffers.len()] };
+    let seconds = |program: &Program| {
+        let of_lanes = of_lanes(program);
+        program.predicted(|b| of_lanes[b.0 as usize])
+    };
+    let program = compiled(&step, &target, run.networks, |both| Ok(untried(both, seconds)))?;
+    // What a given device cannot bind is refused when the program is loaded onto it.
+    let limits = gpu.then(|| forms.limits(&target, Limits { max_binding: u64::MAX, ..Limits::default() }));
+    Ok((Plan { of_lanes: of_lanes(&program), program, measured: None, limits }, step, recorded))
+}
+
+/// What a CPU would run: this build has no kernels for GPUs.
+#[cfg(not(feature = "gpu"))]
+fn untested(experiment: &Experiment, args: &ExplainArgs) -> anyhow::Result<(Plan, Step, Duration)> {
+    let target = if args.target == TargetChoice::Gpu { Target::gpu() } else { Target::cpu() };
+    let (step, recorded) = record(experiment, target.kind)?;
+    let networks = experiment.layered.settings.run.networks;
+    let program = compiled(&step, &target, networks, |both| Ok(untried(both, |p| p.predicted(|_| 4))))?;
+    Ok((Plan { of_lanes: vec![4; program.buffers.len()], program, measured: None }, step, recorded))
 }
 
 /// The training step, and how long it took to record and differentiate it.
@@ -109,11 +192,12 @@ fn record(experiment: &Experiment, target: TargetKind) -> Result<(Step, Duration
 
 /// A file a kernel, numbered in the order in which they run.
 #[cfg(feature = "gpu")]
-fn kernels(program: &Program, artefact: Artefact) -> anyhow::Result<Vec<(String, Vec<u8>)>> {
-    use raygrad_kernels::gpu::{Inputs, Limits, lower};
-    // No adapter is asked: what a given one cannot bind is refused when the program is loaded onto it.
-    let limits = Limits { max_binding: u64::MAX, ..Limits::default() };
-    let lowered = lower(program, &mut Inputs::default(), &limits)?;
+fn kernels(experiment: &Experiment, plan: &Plan, artefact: Artefact) -> anyhow::Result<Vec<(String, Vec<u8>)>> {
+    let Some(limits) = &plan.limits else {
+        let problem = "expected a GPU, which alone runs kernels that could be shown, found the CPU";
+        return Err(raygrad::Error::from(experiment.layered.refuse("--device", problem)).into());
+    };
+    let lowered = lower(&plan.program, &mut Inputs::default(), limits)?;
     let mut files = vec![];
     for (i, kernel) in lowered.launches.iter().flat_map(|l| &l.kernels).enumerate() {
         let name: String = kernel.name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect();
@@ -129,8 +213,23 @@ fn kernels(program: &Program, artefact: Artefact) -> anyhow::Result<Vec<(String,
 }
 
 #[cfg(not(feature = "gpu"))]
-fn kernels(_: &Program, _: Artefact) -> anyhow::Result<Vec<(String, Vec<u8>)>> {
+fn kernels(_: &Experiment, _: &Plan, _: Artefact) -> anyhow::Result<Vec<(String, Vec<u8>)>> {
     anyhow::bail!("this build has no GPU kernels (feature `wgpu` or `vulkan`)")
+}
+
+/// Removes the kernels that an earlier call left in a folder: they are of another program.
+fn remove_kernels(folder: &Path) -> Result<(), raygrad::Error> {
+    let failed = |source| WriteError { path: folder.to_path_buf(), source };
+    for entry in std::fs::read_dir(folder).map_err(failed)? {
+        let path = entry.map_err(failed)?.path();
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        let kernel = name.ends_with(".wgsl") || name.ends_with(".spv");
+        let number = name.split('_').next().unwrap_or_default();
+        if kernel && number.len() == 3 && number.bytes().all(|b| b.is_ascii_digit()) {
+            std::fs::remove_file(&path).map_err(|source| WriteError { path, source })?;
+        }
+    }
+    Ok(())
 }
 
 /// One line an op, operands before users.

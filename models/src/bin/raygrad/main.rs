@@ -9,6 +9,7 @@ mod eval;
 mod explain;
 mod export;
 mod held;
+mod launches;
 mod make_scene;
 mod progress;
 mod surface;
