@@ -5,7 +5,7 @@
 
 use super::temporaries::lane_program;
 use super::*;
-use crate::cpu::{Isa, Operand, Operands, apply};
+use crate::cpu::{Isa, Operand};
 use raygrad_compiler::plan::Program;
 use raygrad_compiler::plan::region::{InstId, Region, RegionOp, Store};
 
@@ -210,21 +210,8 @@ impl Flat {
             };
             for (i, (program, args)) in self.insts.iter().enumerate() {
                 let args: Vec<Operand> = args.iter().map(&mut operand).collect();
-                for (j, (prim, sources, to)) in program.code.iter().enumerate() {
-                    let last = j + 1 == program.code.len();
-                    let out =
-                        if last { values.wrapping_add(i * BLOCK) } else { temps.wrapping_add(*to as usize * BLOCK) };
-                    let mut operands = Operands::NONE;
-                    for (i, source) in sources.iter().enumerate() {
-                        match *source {
-                            Source::Const(bits) => operands.set(i, Operand::Splat(bits)),
-                            Source::Temp(t) => operands.set(i, Operand::Lanes(temps.wrapping_add(t as usize * BLOCK))),
-                            Source::Arg(a) => operands.set(i, args[a as usize]),
-                        }
-                    }
-                    // SAFETY: blocks of `len` lanes.
-                    unsafe { apply(isa, *prim, out, &operands, len) };
-                }
+                // SAFETY: blocks of `len` lanes.
+                unsafe { program.run(isa, |a| args[a as usize], temps, values.wrapping_add(i * BLOCK), len) };
             }
             for (arg, to) in &self.stores {
                 let to = buffer(*to).wrapping_add(start);

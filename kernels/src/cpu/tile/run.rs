@@ -4,7 +4,7 @@ mod scans;
 mod transfer;
 
 use super::*;
-use crate::cpu::{Epilogue, Gemm, Isa, Operand, Operands, ROW_BLOCK, apply, gemm, pack_panels};
+use crate::cpu::{Epilogue, Gemm, Isa, Operand, ROW_BLOCK, apply, gemm, pack_panels};
 use raygrad_compiler::ops::sym_eig::jacobi;
 
 /// Base addresses of a program's buffers, by [`BufferId`].
@@ -228,29 +228,13 @@ impl Tile<'_> {
             let mut start = 0;
             while start < lanes {
                 let len = BLOCK.min(lanes - start);
-                for (i, (prim, sources, to)) in program.code.iter().enumerate() {
-                    let out = if i + 1 == program.code.len() {
-                        self.at(run.out).wrapping_add(start)
-                    } else {
-                        temps.wrapping_add(*to as usize * BLOCK)
-                    };
-                    let mut operands = Operands::NONE;
-                    for (i, source) in sources.iter().enumerate() {
-                        match *source {
-                            Source::Const(bits) => operands.set(i, Operand::Splat(bits)),
-                            Source::Temp(t) => operands.set(i, Operand::Lanes(temps.wrapping_add(t as usize * BLOCK))),
-                            Source::Arg(a) => match run.args[a as usize] {
-                                RunArg::Lanes(at) => operands.set(i, Operand::Lanes(self.at(at).wrapping_add(start))),
-                                // SAFETY: the place is inside the scratch.
-                                RunArg::Splat(at) => unsafe {
-                                    operands.set(i, Operand::Splat((*self.at(at)).to_bits()));
-                                },
-                            },
-                        }
-                    }
-                    // SAFETY: all operands have `len` lanes from `start`; an overwritten operand has the run's own places.
-                    unsafe { apply(self.isa, *prim, out, &operands, len) };
-                }
+                let arg = |a: u8| match run.args[a as usize] {
+                    RunArg::Lanes(at) => Operand::Lanes(self.at(at).wrapping_add(start)),
+                    // SAFETY: the place is inside the scratch.
+                    RunArg::Splat(at) => Operand::Splat(unsafe { (*self.at(at)).to_bits() }),
+                };
+                // SAFETY: all operands have `len` lanes from `start`; an overwritten operand has the run's own places.
+                unsafe { program.run(self.isa, arg, temps, self.at(run.out).wrapping_add(start), len) };
                 start += len;
             }
         }

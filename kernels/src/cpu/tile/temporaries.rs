@@ -1,6 +1,7 @@
 //! Temporaries of pointwise programs: as few blocks of lanes as the longest-lived results need.
 
-use super::{LaneProgram, Source};
+use super::{BLOCK, LaneProgram, Source};
+use crate::cpu::{Isa, Operand, Operands, apply};
 use raygrad_compiler::scalar::{ScalarProgram, Val};
 
 /// Assigns temporaries to a scalar program's intermediate results.
@@ -41,4 +42,28 @@ pub(super) fn lane_program(program: &ScalarProgram) -> LaneProgram {
         code.push((*prim, sources, to));
     }
     LaneProgram { code, temps: temps as usize }
+}
+
+impl LaneProgram {
+    /// Computes `len` lanes, at most [`BLOCK`]; the last instruction writes `out`.
+    ///
+    /// # Safety
+    /// `isa.supported()`. `temps` has a block for each temporary, and the arguments and `out` have `len` lanes.
+    pub(super) unsafe fn run(&self, isa: Isa, arg: impl Fn(u8) -> Operand, temps: *mut f32, out: *mut f32, len: usize) {
+        let temporary = |t: u8| temps.wrapping_add(t as usize * BLOCK);
+        for (i, (prim, sources, to)) in self.code.iter().enumerate() {
+            let out = if i + 1 == self.code.len() { out } else { temporary(*to) };
+            let mut operands = Operands::NONE;
+            for (i, source) in sources.iter().enumerate() {
+                let operand = match *source {
+                    Source::Const(bits) => Operand::Splat(bits),
+                    Source::Temp(t) => Operand::Lanes(temporary(t)),
+                    Source::Arg(a) => arg(a),
+                };
+                operands.set(i, operand);
+            }
+            // SAFETY: forwarded contract.
+            unsafe { apply(isa, *prim, out, &operands, len) };
+        }
+    }
 }
