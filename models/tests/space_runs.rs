@@ -56,7 +56,7 @@ fn an_interrupted_run_resumes_bit_by_bit_with_every_method() {
         &["warp.method=global", "train.relocalise_every=3"],
         &["warp.method=none", "scene.poses=truth"],
         &["warp.method=invertible", "warp.activation=softplus", "warp.inn.anneal=point-slots"],
-        &["warp.method=multi-invertible"],
+        &["warp.method=multi-invertible", "train.error_map=3"],
         &["warp.method=global", "train.fine_samples=6", "train.density_noise=0.5", "train.opaque_background=true"],
         &["warp.method=se3-field", "field.kind=gaussian", "field.encoding=none", "radiance.init=fan-in"],
         // Cameras that all look the same way see nothing of the scene as it is, but everything runs.

@@ -88,6 +88,8 @@ pub struct TrainSettings {
     /// More of one ray, for a second field; 0 for none.
     pub fine_samples: usize,
     pub shared_pixels: bool,
+    /// Cells along a side of the maps of errors that choose pixels; 0 for none.
+    pub error_map: usize,
     pub stratified: bool,
     pub depth: DepthSettings,
     /// Near, far; inverse depths for `inverse`.

@@ -11,6 +11,8 @@ const MAX_BANDS: usize = 20;
 const MAX_BLOCKS: usize = 64;
 const MAX_PATCHES: usize = 1000;
 const MAX_SIDE: usize = 16384;
+/// Most cells along a side of a view's map of errors.
+const MOST_CELLS: usize = 1024;
 /// Most samples of a ray.
 const MAX_SAMPLES: usize = 1024;
 
@@ -119,6 +121,10 @@ impl Layered {
                  found [{near}, {far}]"
             );
             return Err(self.refuse("train.range", text));
+        }
+        if train.error_map > MOST_CELLS {
+            let text = format!("expected at most {MOST_CELLS} cells along a side, found {}", train.error_map);
+            return Err(self.refuse("train.error_map", text));
         }
         if s.warp.method != Method::None && s.warp.dof != Dof::Pose {
             return Err(

@@ -1,6 +1,7 @@
 //! A 3D model on a device: its programs, their inputs, and steps.
 
 use super::data::{SpaceData, SpaceDataError};
+use super::error_map;
 use super::model::{self, RadianceModel, nothing_found};
 use super::relocalise::relocalise;
 use super::results;
@@ -78,6 +79,8 @@ impl Explorer {
         learner.set_seed(model::SEED, settings.run.seed)?;
         learner.set(model::POSES, &flat_rows(&data.start.poses))?;
         learner.set(model::FOUND, &nothing_found(views))?;
+        let side = settings.train.as_ref().map_or(0, |t| t.error_map);
+        learner.set(error_map::ERROR_MAP, &error_map::untried(views, side))?;
         let intrinsics: Vec<f32> = data.scene.train.iter().flat_map(|v| lens(&v.intrinsics)).collect();
         learner.set(model::INTRINSICS, &intrinsics)?;
         let relocalises = relocalise_every(settings) > 0;

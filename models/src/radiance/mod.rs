@@ -1,6 +1,7 @@
 //! Registration in space: cameras find their poses while a radiance field is learned from their images.
 
 pub mod data;
+mod error_map;
 pub mod evaluate;
 pub mod explorer;
 mod export;

@@ -9,9 +9,10 @@
 //! With hierarchical sampling the fine field's picture gives a second render term, of the same weight.
 //!
 //! T_b is the rigid motion of frame b fitted to the map (L2G-NeRF's global alignment, the invertible warp's rigidity prior).
-//! Every step sees all frames, by default the same pixels in each. The fitted poses are kept as a state: near and far follow them in the
+//! Every step sees all frames, by default the same pixels in each, or those that an [`ErrorMap`] draws. The fitted poses are kept as a state: near and far follow them in the
 //! next step, and evaluation starts from them.
 
+use super::error_map::ErrorMap;
 use super::rays::{Cameras, ImageSize, Rays, range_of};
 use super::rendering::{Purpose, Rendering, Seen};
 use crate::config::{DepthSettings, RadianceSettings, SceneSettings, Settings, TrainSettings};
@@ -140,18 +141,28 @@ impl RadianceModel {
     pub fn train_step(&self) -> Step {
         let ray = Axis::new("ray", self.rays_per_view());
         let step = seeded_step();
+        let shape = Shape::new(&[&self.frame, &self.pixel], 1).with_dtype(DType::U32);
+        let colors = |index: &Tensor| on_white(&Tensor::data(IMAGES, shape.clone()).take(index, &self.pixel));
+        if self.train.error_map > 0 {
+            let (map, index) = ErrorMap::draw(&self.frame, &ray, self.train.error_map, self.size, &step);
+            return self.step_of(&ray, &index, &colors(&index), Some(map));
+        }
         let mut drawn = vec![ray.clone()];
         drawn.extend((!self.train.shared_pixels).then(|| self.frame.clone()));
         let draw = random::uniform(&Axes::new(drawn), 1, PIXELS, &step);
         let pixels = self.size.pixels() as f64;
         let index = (draw * pixels).clamp(0.0, pixels - 1.0).to_u32();
-        let shape = Shape::new(&[&self.frame, &self.pixel], 1).with_dtype(DType::U32);
-        self.step_at(&ray, &index, &on_white(&Tensor::data(IMAGES, shape).take(&index, &self.pixel)))
+        self.step_of(&ray, &index, &colors(&index), None)
     }
 
     /// One training step on the pixels `index` along `ray`, and along the frames if theirs differ; `colors` are theirs,
     /// `[frame, ray] x 3`.
     pub fn step_at(&self, ray: &Axis, index: &Tensor, colors: &Tensor) -> Step {
+        self.step_of(ray, index, colors, None)
+    }
+
+    /// The same where a map of errors has drawn the pixels.
+    fn step_of(&self, ray: &Axis, index: &Tensor, colors: &Tensor, map: Option<ErrorMap>) -> Step {
         let intrinsics = Tensor::data(INTRINSICS, Shape::new(&[&self.frame], 4));
         let rough = Tensor::input(POSES, Role::State, Shape::new(&[&self.frame], (3, 4)));
         let cameras = Cameras::new(&self.frame, ray, index, self.size, &intrinsics, &rough);
@@ -189,6 +200,7 @@ impl RadianceModel {
             hold_first(&mut updates, &code.tensor, &self.frame);
         }
         updates.push((known, transform));
+        updates.extend(map.map(|map| map.updated(&seen.best().color, colors)));
         Step { outputs, updates }
     }
 
