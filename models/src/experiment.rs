@@ -254,7 +254,7 @@ impl Experiment {
         } else {
             match folder.start(settings) {
                 // Nobody asked for this folder, and another run has taken it meanwhile.
-                Err(FolderError::Occupied { .. }) if self.out.is_none() => {
+                Err(FolderError::Occupied { .. } | FolderError::InUse { .. }) if self.out.is_none() => {
                     path = self.folder();
                     folder = RunFolder::claim(&path, settings)?;
                     folder.start(settings)?;

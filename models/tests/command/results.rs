@@ -13,6 +13,7 @@ fn a_run_leaves_metrics_pictures_checkpoint_and_report() {
     let mut found = names(&w.path("run"));
     found.sort();
     let expected = [
+        ".lock",
         "checkpoint-0000012.safetensors",
         "checkpoint.json",
         "config.toml",
