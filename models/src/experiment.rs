@@ -19,7 +19,7 @@ use crate::report::median;
 use crate::run::checkpoint::Checkpoint;
 use crate::run::metrics::{Entry, Metrics};
 use crate::run::{FolderError, RunFolder};
-use crate::training::{Training, due};
+use crate::training::{Training, Watch, due};
 use crate::warps::{self, Warp};
 use raygrad_runtime::{Device, DeviceError};
 use std::path::{Path, PathBuf};
@@ -43,8 +43,10 @@ pub struct Experiment {
 pub struct Outcome {
     pub metrics: Metrics,
     pub folder: PathBuf,
-    /// Whether it was stopped before its last step; it can be resumed.
+    /// Whether it was stopped before its results were written; it can be resumed.
     pub interrupted: bool,
+    /// Whether all steps were taken.
+    pub trained: bool,
     /// The headline numbers of a finished run, as lines of text.
     pub summary: String,
 }
@@ -235,7 +237,7 @@ impl Experiment {
         Ok(device.with_precision(precision.into())?)
     }
 
-    /// Trains until the last step is done or `stop` is set, which ends the run with a checkpoint.
+    /// Trains until the last step is done and the results are written, or `stop` is set, which ends the run with a checkpoint.
     pub fn train_observed(&self, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<Outcome, Error> {
         self.layered.validate()?;
         let settings = &self.layered.settings;
@@ -271,16 +273,20 @@ impl Experiment {
         }
         run.begun = Instant::now();
         observer.begin(&path, trainer.steps_done(), settings.optim.taken());
-        let interrupted = self.run_steps(&mut run, &mut *trainer, &folder, observer, stop)?;
-        if !interrupted {
+        let trained = !self.run_steps(&mut run, &mut *trainer, &folder, observer, stop)?;
+        if trained {
             observer.finishing();
             let Run { metrics, seconds, begun, .. } = &mut run;
             let elapsed = || *seconds + begun.elapsed().as_secs_f64();
-            trainer.finish(&folder, &self.layered, metrics, &elapsed)?;
+            match trainer.finish(&folder, &self.layered, metrics, &elapsed, Watch::new(&|_, _| {}, stop)) {
+                Err(Error::Stopped) => metrics.last = None,
+                other => other?,
+            }
         }
+        let interrupted = run.metrics.last.is_none();
         let summary = run.metrics.last.as_ref().map_or(String::new(), |last| trainer.summary(last));
         folder.write("metrics.json", run.metrics.to_json().as_bytes())?;
-        Ok(Outcome { metrics: run.metrics, folder: path, interrupted, summary })
+        Ok(Outcome { metrics: run.metrics, folder: path, interrupted, trained, summary })
     }
 
     /// The steps that are left; whether they were cut short. A device that is lost takes with it what was learnt since the

@@ -4,7 +4,7 @@ use super::*;
 use crate::config::Layered;
 use crate::evaluation::Evaluation;
 use crate::run::Final;
-use crate::training::Learner;
+use crate::training::{Learner, Watch};
 use raygrad_runtime::{ProgramId, RunError};
 
 /// A training whose device is lost at some step.
@@ -48,8 +48,8 @@ impl Training for Losing {
     fn write_frame(&mut self, folder: &RunFolder) -> Result<(), Error> {
         self.inner.write_frame(folder)
     }
-    fn write_evaluation(&mut self, folder: &RunFolder, progress: &dyn Fn(usize, usize)) -> Result<Evaluation, Error> {
-        self.inner.write_evaluation(folder, progress)
+    fn write_evaluation(&mut self, folder: &RunFolder, watch: Watch) -> Result<Evaluation, Error> {
+        self.inner.write_evaluation(folder, watch)
     }
     fn finish(
         &mut self,
@@ -57,8 +57,9 @@ impl Training for Losing {
         layered: &Layered,
         metrics: &mut Metrics,
         seconds: &dyn Fn() -> f64,
+        watch: Watch,
     ) -> Result<(), Error> {
-        self.inner.finish(folder, layered, metrics, seconds)
+        self.inner.finish(folder, layered, metrics, seconds, watch)
     }
     fn summary(&self, last: &Final) -> String {
         self.inner.summary(last)

@@ -1,6 +1,8 @@
 //! Runs in space from start to end, on the built-in scene at a size for a test.
 
-use raygrad::{Experiment, Observer, Quiet};
+use raygrad::run::RunFolder;
+use raygrad::training::{Training, Watch};
+use raygrad::{Error, Experiment, Observer, Quiet};
 use serde_json::Value;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -90,6 +92,45 @@ fn searches_that_find_no_lost_camera_leave_a_run_as_it_is() {
         std::fs::read(run.join(format!("checkpoint-{STEPS:07}.safetensors"))).unwrap()
     };
     assert!(bits(0) == bits(3));
+}
+
+/// Stops a run once all steps are taken.
+struct StopAtEnd<'a>(&'a AtomicBool);
+
+impl Observer for StopAtEnd<'_> {
+    fn finishing(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+#[test]
+fn a_run_that_is_stopped_while_it_is_measured_goes_on_from_there() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = dir.path().join("run");
+    let stop = AtomicBool::new(false);
+    let outcome = tiny(&[], &run).train_observed(&mut StopAtEnd(&stop), &stop).unwrap();
+    assert!(outcome.interrupted && outcome.trained && outcome.metrics.last.is_none());
+    assert!(run.join("metrics.json").exists() && !run.join("evaluation.json").exists());
+    let mut explorer = Experiment::of_run(&run).unwrap().restored_explorer().unwrap();
+    let folder = RunFolder::open(&run).unwrap();
+    // Between two views.
+    let stop = AtomicBool::new(false);
+    let after_one = |done, _| stop.store(done == 1, Ordering::Relaxed);
+    let stopped = explorer.write_evaluation(&folder, Watch::new(&after_one, &stop));
+    assert!(matches!(stopped, Err(Error::Stopped)), "{stopped:?}");
+    assert!(run.join("test/000.png").exists() && !run.join("test/001.png").exists());
+    assert!(!run.join("evaluation.json").exists());
+    // Within one.
+    let view = explorer.data.scene.test[0].clone();
+    let watch = Watch::new(&|_, _| {}, &stop);
+    let pose = view.pose.unwrap();
+    assert!(matches!(explorer.render(&pose, &view.intrinsics, watch), Err(Error::Stopped)));
+    assert!(matches!(explorer.refined(&pose, &view, watch), Err(Error::Stopped)));
+    let measured = explorer.write_evaluation(&folder, Watch::none()).unwrap();
+    let outcome = tiny(&[], &run).resume(true).train().unwrap();
+    assert!(!outcome.interrupted && run.join("report.html").exists());
+    let written = std::fs::read_to_string(run.join("evaluation.json")).unwrap();
+    assert_eq!(written, measured.to_json());
 }
 
 #[test]

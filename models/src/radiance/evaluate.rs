@@ -10,6 +10,7 @@ use crate::evaluation::{
 };
 use crate::geometry::Pose;
 use crate::scene::View;
+use crate::training::Watch;
 
 /// What was found of a model.
 #[derive(Clone, Debug)]
@@ -32,10 +33,10 @@ pub struct Seen<'a> {
     pub scale: f64,
 }
 
-/// Measures the model as it is. `show` gets every test view once, and `progress` hears how many of how many are done.
+/// Measures the model as it is. `show` gets every test view once, and `watch` hears how many of how many are done.
 pub fn evaluate(
     explorer: &mut Explorer,
-    progress: &dyn Fn(usize, usize),
+    watch: Watch,
     mut show: impl FnMut(&Seen) -> Result<(), Error>,
 ) -> Result<Found, Error> {
     let (data, lpips) = (explorer.data.clone(), explorer.lpips.clone());
@@ -50,17 +51,17 @@ pub fn evaluate(
         data.scene.test.iter().enumerate().filter_map(|(i, v)| Some((i, v, v.pose?))).collect();
     let (mut before, mut after) = (vec![], vec![]);
     for (done, (index, view, reference)) in test.iter().enumerate() {
-        progress(done, test.len());
+        watch.done(done, test.len());
         let score = |rendered: &Rendered| -> Result<ViewScores, Error> {
             let scores = scores(rendered, view, similarity.scale, lpips.as_deref())?;
             Ok(ViewScores { view: view.name.clone(), scores })
         };
         let pose = similarity.to_learned(reference);
-        let mut rendered = explorer.render(&pose, &view.intrinsics)?;
+        let mut rendered = explorer.render(&pose, &view.intrinsics, watch)?;
         before.push(score(&rendered)?);
         if refines {
-            let refined = explorer.refined(&pose, view)?;
-            rendered = explorer.render(&refined, &view.intrinsics)?;
+            let refined = explorer.refined(&pose, view, watch)?;
+            rendered = explorer.render(&refined, &view.intrinsics, watch)?;
             after.push(score(&rendered)?);
         }
         show(&Seen { index: *index, view, rendered, scale: similarity.scale })?;

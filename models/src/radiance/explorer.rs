@@ -12,7 +12,7 @@ use crate::run::metrics::{Entry, Final, Measured, Metrics, Relocalised};
 use crate::run::{Checkpoint, RunFolder};
 use crate::scene::{Intrinsics, View};
 use crate::training::learner::psnr;
-use crate::training::{Learner, Training, due};
+use crate::training::{Learner, Training, Watch, due};
 use crate::warps::Warp;
 use raygrad_compiler::functions::adam::Adam;
 use raygrad_runtime::{Device, ProgramId};
@@ -117,13 +117,14 @@ impl Explorer {
         Ok(rough.chunks(12).zip(found.chunks(12)).map(one).collect())
     }
 
-    /// The whole image of a camera in the learned world.
-    pub fn render(&mut self, pose: &Pose, intrinsics: &Intrinsics) -> Result<Rendered, Error> {
+    /// The whole image of a camera in the learned world, unless `watch` stops it before.
+    pub fn render(&mut self, pose: &Pose, intrinsics: &Intrinsics, watch: Watch) -> Result<Rendered, Error> {
         self.learner.set(model::VIEW_INTRINSICS, &lens(intrinsics))?;
         self.set_pose(pose)?;
         let pixels = self.data.size.pixels();
         let mut seen = Rendered { rgb: vec![], depth: vec![], opacity: vec![] };
         for first in (0..pixels).step_by(self.view_pixels) {
+            watch.check()?;
             self.learner.set_u32(model::VIEW_FIRST, &[first as u32])?;
             self.learner.run(self.view)?;
             let left = self.view_pixels.min(pixels - first);
@@ -139,15 +140,15 @@ impl Explorer {
         Ok(seen)
     }
 
-    /// `pose` after test-time refinement against a view's image.
-    pub fn refined(&mut self, pose: &Pose, view: &View) -> Result<Pose, Error> {
+    /// `pose` after test-time refinement against a view's image, unless `watch` stops it before.
+    pub fn refined(&mut self, pose: &Pose, view: &View, watch: Watch) -> Result<Pose, Error> {
         let steps = self.settings.train.as_ref().map_or(0, |t| t.refine_steps);
         show(&mut self.learner, &view.intrinsics, &model::packed(view).collect::<Vec<_>>())?;
-        self.refine(pose, steps, self.settings.optim.lr_warp)
+        self.refine(pose, steps, self.settings.optim.lr_warp, watch)
     }
 
     /// `pose` refined against the image that is shown: `P Exp(twist)` with Adam on the twist, the field as it is.
-    pub(super) fn refine(&mut self, pose: &Pose, steps: usize, rate: f64) -> Result<Pose, Error> {
+    pub(super) fn refine(&mut self, pose: &Pose, steps: usize, rate: f64, watch: Watch) -> Result<Pose, Error> {
         self.set_pose(pose)?;
         for state in [model::TWIST.to_string(), format!("adam.m.{}", model::TWIST), format!("adam.v.{}", model::TWIST)]
         {
@@ -155,6 +156,7 @@ impl Explorer {
         }
         self.learner.set(model::TWIST_LR, &[rate as f32])?;
         for step in 1..=steps {
+            watch.check()?;
             let (bias1, bias2) = Adam::default().bias_corrections(step as u64);
             self.learner.set(model::TWIST_BIAS1, &[bias1 as f32])?;
             self.learner.set(model::TWIST_BIAS2, &[bias2 as f32])?;
@@ -297,8 +299,8 @@ impl Training for Explorer {
     fn write_frame(&mut self, folder: &RunFolder) -> Result<(), Error> {
         results::write_frame(folder, self)
     }
-    fn write_evaluation(&mut self, folder: &RunFolder, progress: &dyn Fn(usize, usize)) -> Result<Evaluation, Error> {
-        Ok(results::write_evaluation(folder, self, progress)?.evaluation)
+    fn write_evaluation(&mut self, folder: &RunFolder, watch: Watch) -> Result<Evaluation, Error> {
+        Ok(results::write_evaluation(folder, self, watch)?.evaluation)
     }
     fn finish(
         &mut self,
@@ -306,11 +308,12 @@ impl Training for Explorer {
         layered: &Layered,
         metrics: &mut Metrics,
         seconds: &dyn Fn() -> f64,
+        watch: Watch,
     ) -> Result<(), Error> {
         // Of a finished run that is resumed no step was taken that could be measured.
         let entry = metrics.steps.last().cloned().map_or_else(|| self.measure(), Ok)?;
         metrics.last = Some(Final { entry, seconds: seconds(), warps: vec![] });
-        let written = results::write_evaluation(folder, self, &|_, _| {})?;
+        let written = results::write_evaluation(folder, self, watch)?;
         results::write_report(folder, layered, self, metrics, &written)?;
         self.evaluation = Some(written.evaluation);
         Ok(())

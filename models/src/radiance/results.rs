@@ -13,7 +13,7 @@ use crate::run::RunFolder;
 use crate::run::metrics::Metrics;
 use crate::run::results::{FRAMES, animation};
 use crate::scene::{Layout, View, stand_around};
-use crate::training::Training;
+use crate::training::{Training, Watch};
 
 /// Test views shown in the report.
 const SHOWN: usize = 6;
@@ -42,21 +42,17 @@ pub fn write_frame(folder: &RunFolder, explorer: &mut Explorer) -> Result<(), Er
         Some(pose) => explorer.data.similarity(&poses).map_err(SpaceDataError::from)?.to_learned(&pose),
         None => poses[0],
     };
-    let seen = explorer.render(&pose, &intrinsics)?;
+    let seen = explorer.render(&pose, &intrinsics, Watch::none())?;
     let canvas = Canvas::from_colors(intrinsics.width, intrinsics.height, &seen.rgb);
     folder.write(&format!("{FRAMES}/{:07}.png", explorer.steps_done()), &canvas.to_png()?)?;
     Ok(())
 }
 
 /// Measures the model, and writes `evaluation.json`, the test views, the poses and a plot of the cameras.
-pub fn write_evaluation(
-    folder: &RunFolder,
-    explorer: &mut Explorer,
-    progress: &dyn Fn(usize, usize),
-) -> Result<Written, Error> {
+pub fn write_evaluation(folder: &RunFolder, explorer: &mut Explorer, watch: Watch) -> Result<Written, Error> {
     let shifted = explorer.data.scene.layout == Layout::Blender;
     let mut shown = vec![];
-    let found = evaluate(explorer, progress, |seen| {
+    let found = evaluate(explorer, watch, |seen| {
         let (i, lens, rendered) = (seen.index, &seen.view.intrinsics, &seen.rendered);
         let rgb = Canvas::from_colors(lens.width, lens.height, &rendered.rgb);
         folder.write(&format!("test/{i:03}.png"), &rgb.to_png()?)?;

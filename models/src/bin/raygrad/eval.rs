@@ -11,10 +11,11 @@ use raygrad::evaluation::{Evaluation, Measured, PublishedTable, Table, published
 use raygrad::run::RunFolder;
 use raygrad::run::files::write_atomically;
 use raygrad::scene::Layout;
-use raygrad::training::Training;
+use raygrad::training::{Training, Watch};
 use serde::Serialize;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::atomic::AtomicBool;
 
 #[derive(Args)]
 pub struct EvalArgs {
@@ -65,17 +66,19 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     let settings = experiment.layered.settings.clone();
     let had_lpips =
         std::fs::read_to_string(folder.path().join("evaluation.json")).is_ok_and(|t| t.contains("\"lpips\""));
+    // Ctrl-C ends this command at once: what it writes is written as whole files.
+    let never = AtomicBool::new(false);
     let (evaluation, step, surface, layout);
     if settings.scene.is_some() || args.surface.wanted() {
         let mut explorer = experiment.restored_explorer()?;
-        evaluation = measure(&mut explorer, &folder)?;
+        evaluation = measure(&mut explorer, &folder, &never)?;
         layout = Some(explorer.data.scene.layout);
         step = explorer.steps_done();
         // Of what was measured something is told in any case.
         surface = args.surface.wanted().then(|| args.surface.run(&mut explorer, &checked)).transpose();
     } else {
         let mut trainer = experiment.restored()?;
-        evaluation = measure(&mut *trainer, &folder)?;
+        evaluation = measure(&mut *trainer, &folder, &never)?;
         (step, surface, layout) = (trainer.steps_done(), Ok(None), None);
     }
     let dataset = layout.map_or("planar", Layout::name);
@@ -116,10 +119,10 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Measures a model and writes what it finds into its run's folder, with a bar over the views.
-pub fn measure(model: &mut dyn Training, folder: &RunFolder) -> Result<Evaluation, Error> {
+/// Measures a model and writes what it finds into its run's folder, with a bar over the views, unless `stop` is set before.
+pub fn measure(model: &mut dyn Training, folder: &RunFolder, stop: &AtomicBool) -> Result<Evaluation, Error> {
     let shown = bar("evaluating", "views");
-    let evaluation = model.write_evaluation(folder, &|done, all| shown.show(done, all));
+    let evaluation = model.write_evaluation(folder, Watch::new(&|done, all| shown.show(done, all), stop));
     shown.finish();
     evaluation
 }

@@ -50,7 +50,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<ExitCode> {
         eprintln!("run {} of {}: {}", i + 1, sweep.cells.len(), cell.name);
         match train(cell, &folder, args.lpips.as_deref(), &stop) {
             Ok(Some(evaluation)) => done.push((cell, evaluation)),
-            Ok(None) => {
+            Ok(None) | Err(Error::Stopped) => {
                 print(&format!("stopped; continue with the same command and `--out {} --resume`\n", folder.display()))?;
                 return Ok(ExitCode::from(130));
             }
@@ -85,7 +85,7 @@ fn train(
         Progress::Done(evaluation) => {
             let lacks = evaluation.before.as_ref().is_some_and(|b| b.mean.lpips.is_none());
             return match lpips.filter(|_| lacks) {
-                Some(weights) => measured_again(&cell.folder(folder), weights).map(Some),
+                Some(weights) => measured_again(&cell.folder(folder), weights, stop).map(Some),
                 None => Ok(Some(*evaluation)),
             };
         }
@@ -109,7 +109,7 @@ fn train(
 }
 
 /// A finished run with LPIPS, which it was trained without.
-fn measured_again(run: &Path, weights: &Path) -> Result<Evaluation, Error> {
+fn measured_again(run: &Path, weights: &Path, stop: &AtomicBool) -> Result<Evaluation, Error> {
     let mut explorer = Experiment::of_run(run)?.lpips(weights)?.restored_explorer()?;
-    measure(&mut explorer, &RunFolder::open(run)?)
+    measure(&mut explorer, &RunFolder::open(run)?, stop)
 }
