@@ -1,6 +1,6 @@
 //! Measuring, exporting and showing a run that is there.
 
-use crate::workplace::{Workplace, mentions, names};
+use crate::workplace::{Workplace, mentions, names, stderr};
 use raygrad::evaluation::Mesh;
 use safetensors::tensor::{Dtype, TensorView};
 use serde_json::Value;
@@ -131,6 +131,12 @@ fn a_mesh_and_its_distance_to_a_cloud() {
     mentions(&refuse(&["--mesh", "no.ply", "--mesh-bounds", "1,2,3"]), &["--mesh-bounds", "found 3"]);
     mentions(&refuse(&["--cloud", "nowhere.ply"]), &["nowhere.ply"]);
     assert_eq!(w.run(&["eval", "run", "--mesh", "no.stl"]).status.code(), Some(2));
+    for option in [["--mesh-resolution", "8"], ["--mesh-threshold", "1"], ["--mesh-bounds", "-1,1"]] {
+        let output = w.run(&["eval", "run", option[0], option[1]]);
+        assert_eq!(output.status.code(), Some(2), "{option:?}");
+        mentions(&stderr(&output), &["required", "--mesh <FILE>", "--cloud <PLY>"]);
+    }
+    mentions(&w.succeed(&eval(&["--mesh", "both.ply", "--cloud", "whole.ply"])), &["both.ply", "chamfer"]);
     assert!(!w.path("no.ply").exists());
 }
 
@@ -213,4 +219,19 @@ fn runs_that_are_none() {
     std::fs::remove_file(w.path("run/checkpoint.json")).unwrap();
     mentions(&w.refuse(&["eval", "run"]), &["no run in run", "before its first checkpoint"]);
     assert_eq!(w.left_behind(), ["empty", "moved", "run"]);
+}
+
+#[test]
+fn views_that_validate_and_test_are_counted_once() {
+    let w = Workplace::new();
+    w.succeed(&["make-scene", "scene", "--views", "12", "--size", "8"]);
+    std::fs::rename(w.path("scene/transforms_train.json"), w.path("scene/transforms.json")).unwrap();
+    let text = w.succeed(&["data", "scene", "--layout", "transforms"]);
+    let line = |name: &str| text.lines().find_map(|l| l.strip_prefix(name)).unwrap().trim().to_string();
+    let views = line("views");
+    assert!(views.ends_with("(the same)"), "{text}");
+    let counts: Vec<usize> = views.split(' ').filter_map(|w| w.parse().ok()).collect();
+    let all = counts[0] + counts[2];
+    assert!(all > counts[0], "{text}");
+    assert_eq!(line("poses"), format!("{all} of {all} views"));
 }
