@@ -11,11 +11,11 @@
 
 use crate::Error;
 use crate::config::{ConfigError, DeviceChoice, Layered, Origin, Precision};
+use crate::estimate::Estimate;
 use crate::evaluation::Lpips;
 use crate::planar::{PlanarData, Trainer};
 use crate::radiance::data::START;
 use crate::radiance::{Explorer, SpaceData};
-use crate::report::median;
 use crate::run::checkpoint::Checkpoint;
 use crate::run::metrics::{Entry, Metrics};
 use crate::run::{FolderError, RunFolder};
@@ -57,8 +57,8 @@ pub trait Observer {
     fn loading(&self) -> Box<dyn Fn(usize, usize) + Sync> {
         Box::new(|_, _| {})
     }
-    /// How long the steps that are left should take on this device, by its name, in seconds.
-    fn expected(&mut self, _seconds: f64, _device: &str) {}
+    /// How long what is left should take on this device, by its name.
+    fn expected(&mut self, _estimate: &Estimate, _device: &str) {}
     /// The run begins, or goes on, after `done` of `steps` steps.
     fn begin(&mut self, _folder: &Path, _done: usize, _steps: usize) {}
     /// A step was submitted.
@@ -266,10 +266,8 @@ impl Experiment {
             trainer.write_data(&folder)?;
         }
         folder.keep();
-        let left = settings.optim.taken().saturating_sub(trainer.steps_done());
-        if left >= TRIED {
-            let seconds = seconds_per_step(&mut *trainer)?;
-            observer.expected(seconds * left as f64, &trainer.learner().device_name());
+        if let Some(estimate) = Estimate::of(&mut *trainer, settings)? {
+            observer.expected(&estimate, &trainer.learner().device_name());
         }
         run.begun = Instant::now();
         observer.begin(&path, trainer.steps_done(), settings.optim.taken());
@@ -341,32 +339,6 @@ impl Experiment {
         }
         Ok(false)
     }
-}
-
-/// Runs of fewer steps are not timed before they begin.
-const TRIED: usize = 50;
-/// Steps that are timed, or fewer if they take longer than so many seconds.
-const TIMED: usize = 5;
-const TRIAL: f64 = 1.0;
-
-/// Seconds that a step takes, by taking a few and going back to where they began.
-fn seconds_per_step(trainer: &mut dyn Training) -> Result<f64, Error> {
-    let (step, tensors) = (trainer.steps_done(), trainer.tensors()?);
-    let begun = Checkpoint { step, seconds: 0.0, steps: vec![], tensors };
-    let mut one = || -> Result<f64, Error> {
-        let start = Instant::now();
-        trainer.step()?;
-        trainer.wait()?;
-        Ok(start.elapsed().as_secs_f64())
-    };
-    // The first one warms up.
-    one()?;
-    let mut times = vec![];
-    while times.len() < TIMED && times.iter().sum::<f64>() < TRIAL {
-        times.push(one()?);
-    }
-    trainer.restore(&begun)?;
-    Ok(median(&times))
 }
 
 /// What accumulates over a run.

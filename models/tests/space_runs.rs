@@ -94,6 +94,17 @@ fn searches_that_find_no_lost_camera_leave_a_run_as_it_is() {
     assert!(bits(0) == bits(3));
 }
 
+#[test]
+fn the_time_of_an_evaluation_counts_views_and_refinement() {
+    let dir = tempfile::tempdir().unwrap();
+    let trial = |set: &[&str]| tiny(set, &dir.path().join("run")).explorer().unwrap().trial().unwrap();
+    let known = trial(&["warp.method=none", "scene.poses=truth"]);
+    assert!(known.frame > 0.0 && known.evaluation == 2.0 * known.frame, "{known:?}");
+    // Two views, before and after the refinement of their poses.
+    let found = trial(&[]);
+    assert!(found.evaluation > 4.0 * found.frame, "{found:?}");
+}
+
 /// Stops a run once all steps are taken.
 struct StopAtEnd<'a>(&'a AtomicBool);
 
@@ -125,7 +136,7 @@ fn a_run_that_is_stopped_while_it_is_measured_goes_on_from_there() {
     let watch = Watch::new(&|_, _| {}, &stop);
     let pose = view.pose.unwrap();
     assert!(matches!(explorer.render(&pose, &view.intrinsics, watch), Err(Error::Stopped)));
-    assert!(matches!(explorer.refined(&pose, &view, watch), Err(Error::Stopped)));
+    assert!(matches!(explorer.refined(&pose, &view, 3, watch), Err(Error::Stopped)));
     let measured = explorer.write_evaluation(&folder, Watch::none()).unwrap();
     let outcome = tiny(&[], &run).resume(true).train().unwrap();
     assert!(!outcome.interrupted && run.join("report.html").exists());

@@ -4,6 +4,7 @@ use super::data::PlanarData;
 use super::model::{self, PlanarModel};
 use crate::Error;
 use crate::config::{Count, Layered, Settings};
+use crate::estimate::{Trial, timed};
 use crate::evaluation;
 use crate::geometry::Transform;
 use crate::pictures::View;
@@ -162,6 +163,14 @@ impl Training for Trainer {
         metrics.last = Some(Final { entry: found.entry.clone(), seconds: seconds(), warps });
         results::write_evaluation(folder, &self.settings, &self.data.grid, &found)?;
         results::write_results(folder, layered, self, &found, metrics)
+    }
+    fn trial(&mut self) -> Result<Trial, Error> {
+        let frame = timed(|| self.picture(false).map(drop))?;
+        let evaluation = timed(|| {
+            self.evaluate()?;
+            self.picture(true).map(drop)
+        })?;
+        Ok(Trial { frame, evaluation })
     }
     fn summary(&self, last: &Final) -> String {
         let Measured::Planar { patch_psnr_db, corner_error_px } = &last.entry.measured else { return String::new() };

@@ -1,11 +1,13 @@
 //! A 3D model on a device: its programs, their inputs, and steps.
 
 use super::data::{SpaceData, SpaceDataError};
+use super::evaluate::trial;
 use super::model::{self, RadianceModel, nothing_found};
 use super::relocalise::relocalise;
 use super::results;
 use crate::Error;
 use crate::config::{DepthSettings, Layered, Method, Settings};
+use crate::estimate::Trial;
 use crate::evaluation::{Evaluation, Lpips, Metric, Stage};
 use crate::geometry::Pose;
 use crate::run::metrics::{Entry, Final, Measured, Metrics, Relocalised};
@@ -119,30 +121,44 @@ impl Explorer {
 
     /// The whole image of a camera in the learned world, unless `watch` stops it before.
     pub fn render(&mut self, pose: &Pose, intrinsics: &Intrinsics, watch: Watch) -> Result<Rendered, Error> {
-        self.learner.set(model::VIEW_INTRINSICS, &lens(intrinsics))?;
-        self.set_pose(pose)?;
-        let pixels = self.data.size.pixels();
+        self.look(pose, intrinsics)?;
         let mut seen = Rendered { rgb: vec![], depth: vec![], opacity: vec![] };
-        for first in (0..pixels).step_by(self.view_pixels) {
+        for first in self.parts() {
             watch.check()?;
-            self.learner.set_u32(model::VIEW_FIRST, &[first as u32])?;
-            self.learner.run(self.view)?;
-            let left = self.view_pixels.min(pixels - first);
-            let mut read = |name, width: usize| -> Result<Vec<f32>, Error> {
-                let mut values = self.learner.read(self.view, name)?;
-                values.truncate(width * left);
-                Ok(values)
-            };
-            seen.rgb.extend(read("color", 3)?);
-            seen.depth.extend(read("depth", 1)?);
-            seen.opacity.extend(read("opacity", 1)?);
+            self.render_part(first, &mut seen)?;
         }
         Ok(seen)
     }
 
-    /// `pose` after test-time refinement against a view's image, unless `watch` stops it before.
-    pub fn refined(&mut self, pose: &Pose, view: &View, watch: Watch) -> Result<Pose, Error> {
-        let steps = self.settings.train.as_ref().map_or(0, |t| t.refine_steps);
+    /// The camera of the parts that are rendered next.
+    pub(super) fn look(&mut self, pose: &Pose, intrinsics: &Intrinsics) -> Result<(), Error> {
+        self.learner.set(model::VIEW_INTRINSICS, &lens(intrinsics))?;
+        self.set_pose(pose)
+    }
+
+    /// The first pixels of the parts of an image.
+    pub(super) fn parts(&self) -> impl ExactSizeIterator<Item = usize> + use<> {
+        (0..self.data.size.pixels()).step_by(self.view_pixels)
+    }
+
+    /// Renders the part of the image from its first pixel on.
+    pub(super) fn render_part(&mut self, first: usize, seen: &mut Rendered) -> Result<(), Error> {
+        self.learner.set_u32(model::VIEW_FIRST, &[first as u32])?;
+        self.learner.run(self.view)?;
+        let left = self.view_pixels.min(self.data.size.pixels() - first);
+        let mut read = |name, width: usize| -> Result<Vec<f32>, Error> {
+            let mut values = self.learner.read(self.view, name)?;
+            values.truncate(width * left);
+            Ok(values)
+        };
+        seen.rgb.extend(read("color", 3)?);
+        seen.depth.extend(read("depth", 1)?);
+        seen.opacity.extend(read("opacity", 1)?);
+        Ok(())
+    }
+
+    /// `pose` after so many steps of test-time refinement against a view's image, unless `watch` stops it before.
+    pub fn refined(&mut self, pose: &Pose, view: &View, steps: usize, watch: Watch) -> Result<Pose, Error> {
         show(&mut self.learner, &view.intrinsics, &model::packed(view).collect::<Vec<_>>())?;
         self.refine(pose, steps, self.settings.optim.lr_warp, watch)
     }
@@ -317,6 +333,9 @@ impl Training for Explorer {
         results::write_report(folder, layered, self, metrics, &written)?;
         self.evaluation = Some(written.evaluation);
         Ok(())
+    }
+    fn trial(&mut self) -> Result<Trial, Error> {
+        trial(self)
     }
     fn summary(&self, last: &Final) -> String {
         let (steps, time) = (last.entry.step, crate::report::duration(last.seconds));

@@ -12,6 +12,7 @@ pub use watch::Watch;
 
 use crate::Error;
 use crate::config::Layered;
+use crate::estimate::Trial;
 use crate::evaluation::Evaluation;
 use crate::run::checkpoint::Checkpoint;
 use crate::run::metrics::{Entry, Final, Metrics};
@@ -75,6 +76,9 @@ pub trait Training {
         seconds: &dyn Fn() -> f64,
         watch: Watch,
     ) -> Result<(), Error>;
+
+    /// Times parts of an evaluation. Parameters and states may change.
+    fn trial(&mut self) -> Result<Trial, Error>;
 
     /// The headline numbers as lines of text.
     fn summary(&self, last: &Final) -> String;

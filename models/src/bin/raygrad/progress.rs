@@ -1,9 +1,9 @@
 //! Progress of a run on standard error: a bar on a terminal, plain lines elsewhere.
 
 use indicatif::{ProgressBar, ProgressStyle};
-use raygrad::Observer;
 use raygrad::report::duration;
 use raygrad::run::Entry;
+use raygrad::{Estimate, Observer};
 use std::io::IsTerminal;
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -50,8 +50,9 @@ impl Observer for Progress {
         })
     }
 
-    fn expected(&mut self, seconds: f64, device: &str) {
-        let text = format!("about {} of steps on {device}", duration(seconds));
+    fn expected(&mut self, estimate: &Estimate, device: &str) {
+        let [total, training, evaluation] = [estimate.total(), estimate.training, estimate.evaluation].map(duration);
+        let text = format!("about {total} on {device}: {training} of training, {evaluation} of evaluation");
         match &self.bar {
             Some(bar) => bar.println(text),
             None => eprintln!("{text}"),
