@@ -121,6 +121,14 @@ fn a_mesh_and_its_distance_to_a_cloud() {
     assert_eq!(found["mesh"]["triangles"], mesh.triangles.len());
     let distance = found["mesh"]["chamfer"]["mean"].as_f64().unwrap();
     assert!(distance > 0.0 && distance < 2.4 / 16.0, "{distance}");
+    // It is a number of the run like any other.
+    assert_eq!(w.json("run/evaluation.json")["cameras"]["mean"]["chamfer"], distance);
+    let files = ["--cloud", "whole.ply", "--csv", "views.csv", "--latex", "table.tex"];
+    mentions(&w.succeed(&eval(&files)), &["Chamfer distance", &format!("{distance:.3}")]);
+    mentions(&std::fs::read_to_string(w.path("table.tex")).unwrap(), &["Chamfer distance", &format!("{distance:.3}")]);
+    let csv = std::fs::read_to_string(w.path("views.csv")).unwrap();
+    assert!(csv.lines().any(|l| l.contains(",cameras,mean,") && l.ends_with(&format!(",{distance}"))), "{csv}");
+    mentions(&stderr(&w.run(&["eval", "run"])), &["had a Chamfer distance", "--cloud"]);
     w.succeed(&eval(&["--mesh", "part.obj", "--mesh-bounds", "-1,1,-1,1,-0.5,0.5"]));
     let text = std::fs::read_to_string(w.path("part.obj")).unwrap();
     let height = |l: &str| l.strip_prefix("v ").and_then(|l| l.rsplit(' ').next()?.parse::<f64>().ok());

@@ -49,15 +49,15 @@ pub struct Surface {
     vertices: usize,
     triangles: usize,
     #[serde(skip_serializing_if = "Option::is_none")]
-    chamfer: Option<Distances>,
+    pub chamfer: Option<Distances>,
 }
 
 /// In the unit of the scene's files.
 #[derive(Serialize)]
-struct Distances {
+pub struct Distances {
     accuracy: f64,
     completeness: f64,
-    mean: f64,
+    pub mean: f64,
 }
 
 fn mesh_file(name: &str) -> Result<PathBuf, String> {
