@@ -105,6 +105,20 @@ fn the_time_of_an_evaluation_counts_views_and_refinement() {
     assert!(found.evaluation > 4.0 * found.frame, "{found:?}");
 }
 
+#[test]
+fn an_alignment_that_cameras_do_not_determine_is_told() {
+    let dir = tempfile::tempdir().unwrap();
+    for (views, told) in [(2, true), (5, false)] {
+        let run = dir.path().join(views.to_string());
+        let outcome = tiny(&[&format!("scene.train_views={views}")], &run).train().unwrap();
+        let says = |text: &str| text.contains("lie in one point or on one line");
+        assert_eq!(says(&outcome.summary), told, "{}", outcome.summary);
+        assert_eq!(says(&std::fs::read_to_string(run.join("report.html")).unwrap()), told);
+        let evaluation = std::fs::read_to_string(run.join("evaluation.json")).unwrap();
+        assert_eq!(evaluation.contains("\"undetermined\": true"), told, "{evaluation}");
+    }
+}
+
 /// Stops a run once all steps are taken.
 struct StopAtEnd<'a>(&'a AtomicBool);
 

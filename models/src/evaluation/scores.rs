@@ -243,6 +243,10 @@ pub struct Evaluation {
     /// Test views after test-time refinement.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub after: Option<Measured>,
+    /// Whether the camera centres leave the alignment open, see
+    /// [`Similarity::is_ill_conditioned`](super::Similarity::is_ill_conditioned).
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub undetermined: bool,
 }
 
 impl Evaluation {
@@ -250,6 +254,14 @@ impl Evaluation {
     pub fn to_json(&self) -> String {
         // Numbers, strings and lists always have a JSON form.
         serde_json::to_string_pretty(self).unwrap_or_default()
+    }
+
+    /// What is to be said wherever the numbers are shown.
+    pub fn note(&self) -> Option<&'static str> {
+        self.undetermined.then_some(
+            "the camera centres, found or true, lie in one point or on one line, which does not determine the turn that \
+             aligns them: errors of poses and test views mean little",
+        )
     }
 
     /// The views of a stage.

@@ -66,7 +66,8 @@ pub fn evaluate(
         show(&Seen { index: *index, view, rendered, scale: similarity.scale })?;
     }
     let measured = |views: Vec<ViewScores>| (!views.is_empty()).then(|| Measured::new(views));
-    let evaluation = Evaluation { scene, method, cameras, before: measured(before), after: measured(after) };
+    let (before, after, undetermined) = (measured(before), measured(after), similarity.is_ill_conditioned());
+    let evaluation = Evaluation { scene, method, cameras, before, after, undetermined };
     Ok(Found { evaluation, poses, similarity })
 }
 

@@ -354,6 +354,9 @@ impl Training for Explorer {
             let name = format!("test {}", metric.heading());
             text += &format!("{name:<18} {before:.0$}{refined}\n", metric.decimals());
         }
+        if let Some(note) = self.evaluation.as_ref().and_then(Evaluation::note) {
+            text += &format!("note: {note}\n");
+        }
         text + &format!("training PSNR      {:.2} dB\nsteps              {steps} in {time}\n", last.entry.psnr_db())
     }
 }
