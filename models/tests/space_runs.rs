@@ -1,6 +1,6 @@
 //! Runs in space from start to end, on the built-in scene at a size for a test.
 
-use raygrad::run::RunFolder;
+use raygrad::run::{Entry, RunFolder};
 use raygrad::training::{Training, Watch};
 use raygrad::{Error, Experiment, Observer, Quiet};
 use serde_json::Value;
@@ -117,6 +117,34 @@ fn an_alignment_that_cameras_do_not_determine_is_told() {
         let evaluation = std::fs::read_to_string(run.join("evaluation.json")).unwrap();
         assert_eq!(evaluation.contains("\"undetermined\": true"), told, "{evaluation}");
     }
+}
+
+#[test]
+fn a_validation_view_is_looked_at_and_changes_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = |name: &str, every: usize| {
+        let folder = dir.path().join(name);
+        let outcome = tiny(&[&format!("train.validate_every={every}")], &folder).train().unwrap();
+        let bits = std::fs::read(folder.join(format!("checkpoint-{STEPS:07}.safetensors"))).unwrap();
+        let report = std::fs::read_to_string(folder.join("report.html")).unwrap();
+        (outcome.metrics.steps, bits, report.contains("validation view"))
+    };
+    let (without, with) = (run("without", 0), run("with", 8));
+    let seen = |steps: &[Entry]| -> Vec<bool> { steps.iter().map(|e| e.validation_psnr_db().is_some()).collect() };
+    assert_eq!((seen(&without.0), without.2), (vec![false; 3], false));
+    assert_eq!((seen(&with.0), with.2), (vec![false, true, false], true));
+    assert!(with.1 == without.1);
+    // Against the frame of the animation, which is of the same view, rounded to bytes.
+    let explorer = tiny(&[], dir.path()).explorer().unwrap();
+    let photo = explorer.data.scene.val[0].rgb();
+    let again = tiny(&["train.validate_every=12", "run.picture_every=12"], &dir.path().join("frame")).train().unwrap();
+    let frame = image::open(dir.path().join("frame/frames/0000012.png")).unwrap().to_rgb8();
+    let squares = frame.as_raw().iter().zip(&photo).map(|(a, b)| (f64::from(*a) / 255.0 - f64::from(*b)).powi(2));
+    let psnr = -10.0 * (squares.sum::<f64>() / photo.len() as f64).log10();
+    let found = again.metrics.steps.last().unwrap().validation_psnr_db().unwrap();
+    assert!((found - psnr).abs() < 0.1, "{found} {psnr}");
+    let error = tiny(&["train.validate_every=6"], dir.path()).train().unwrap_err().to_string();
+    assert!(error.contains("`train.validate_every`") && error.contains("multiple of `run.log_every`, 4"), "{error}");
 }
 
 /// Stops a run once all steps are taken.

@@ -82,6 +82,16 @@ fn tested(data: &SpaceData) -> Vec<(usize, &View, Pose)> {
     data.scene.test.iter().enumerate().filter_map(|(i, v)| Some((i, v, v.pose?))).collect()
 }
 
+/// PSNR of the first validation view, seen from its true pose as test views are; nothing where that is not known.
+pub fn validate(explorer: &mut Explorer) -> Result<Option<f64>, Error> {
+    let data = explorer.data.clone();
+    let Some((view, truth)) = data.scene.val.first().and_then(|v| Some((v, v.pose?))) else { return Ok(None) };
+    let pose = explorer.learned_pose(&truth)?;
+    let seen = explorer.render(&pose, &view.intrinsics, Watch::none())?;
+    let (width, height, photo) = (view.intrinsics.width, view.intrinsics.height, view.rgb());
+    Ok(Some(psnr(&Picture::new(width, height, &seen.rgb)?, &Picture::new(width, height, &photo)?)?))
+}
+
 /// Times a part of a view, and a step of the refinement of a pose, for all that there are.
 pub fn trial(explorer: &mut Explorer) -> Result<Trial, Error> {
     let data = explorer.data.clone();

@@ -1,7 +1,7 @@
 //! A 3D model on a device: its programs, their inputs, and steps.
 
 use super::data::{SpaceData, SpaceDataError};
-use super::evaluate::trial;
+use super::evaluate::{trial, validate};
 use super::model::{self, RadianceModel, nothing_found};
 use super::relocalise::relocalise;
 use super::results;
@@ -117,6 +117,12 @@ impl Explorer {
         let (rough, found) = (self.learner.session.get(model::POSES)?, self.learner.session.get(model::FOUND)?);
         let one = |(rough, found)| Pose::from_rows::<f32>(rough).after(&Pose::from_rows(found));
         Ok(rough.chunks(12).zip(found.chunks(12)).map(one).collect())
+    }
+
+    /// A pose of the true world in the learned one, by the poses that the last step found.
+    pub(super) fn learned_pose(&mut self, pose: &Pose) -> Result<Pose, Error> {
+        let poses = self.poses()?;
+        Ok(self.data.similarity(&poses).map_err(SpaceDataError::from)?.to_learned(pose))
     }
 
     /// The whole image of a camera in the learned world, unless `watch` stops it before.
@@ -289,11 +295,14 @@ impl Training for Explorer {
         let found = self.poses()?;
         let numbers: Vec<f64> = found.iter().flat_map(|p| p.to_rows()).collect();
         self.learner.check_finite("a pose", &numbers)?;
+        let validates = due(self.settings.train.as_ref().map_or(0, |t| t.validate_every), self.steps_done());
+        let validation_psnr_db = if validates { validate(self)? } else { None };
         let errors = self.data.pose_scores(&found).map_err(SpaceDataError::from)?.mean;
         let measured = Measured::Space {
             psnr_db: psnr(loss.get("render_fine").or(loss.get("render")).copied().unwrap_or(1.0)),
             rotation_error_deg: errors.rotation_error_deg,
             translation_error_x100: errors.translation_error_x100,
+            validation_psnr_db,
         };
         let relocalised = std::mem::take(&mut self.relocalised);
         Ok(Entry { step: self.learner.steps_done(), loss, measured, relocalised })

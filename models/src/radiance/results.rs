@@ -37,10 +37,9 @@ pub fn write_data(folder: &RunFolder, data: &SpaceData) -> Result<(), Error> {
 pub fn write_frame(folder: &RunFolder, explorer: &mut Explorer) -> Result<(), Error> {
     let scene = &explorer.data.scene;
     let Some(View { pose, intrinsics, .. }) = scene.val.first().or(scene.train.first()).cloned() else { return Ok(()) };
-    let poses = explorer.poses()?;
     let pose = match pose {
-        Some(pose) => explorer.data.similarity(&poses).map_err(SpaceDataError::from)?.to_learned(&pose),
-        None => poses[0],
+        Some(pose) => explorer.learned_pose(&pose)?,
+        None => explorer.poses()?[0],
     };
     let seen = explorer.render(&pose, &intrinsics, Watch::none())?;
     let canvas = Canvas::from_colors(intrinsics.width, intrinsics.height, &seen.rgb);

@@ -133,7 +133,9 @@ impl Report<'_> {
             .map(|(name, color)| curve(name, color, 2, &|e| e.loss.get(name).copied()))
             .filter(|c| !c.points.is_empty())
             .collect();
-        let psnr = [curve("PSNR", palette[1], 2, &|e| Some(e.psnr_db()))];
+        let mut psnr = vec![curve("PSNR", palette[1], 2, &|e| Some(e.psnr_db()))];
+        let validation = curve("validation view", palette[2], 2, &Entry::validation_psnr_db);
+        psnr.extend((!validation.points.is_empty()).then_some(validation));
         let mut plots = vec![
             ("Loss terms before weighting, and their weighted sum.", plot("loss", &losses, true)?),
             ("PSNR of the rendered pixels.", plot("dB", &psnr, false)?),

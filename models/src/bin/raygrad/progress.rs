@@ -35,7 +35,8 @@ impl Progress {
         let total = entry.loss.get("total").copied().unwrap_or(0.0);
         let views: Vec<&str> = entry.relocalised.iter().map(|r| r.view.as_str()).collect();
         let back = if views.is_empty() { String::new() } else { format!("  brought back {}", views.join(", ")) };
-        format!("loss {total:.5}  PSNR {:.2} dB  {}{back}", entry.psnr_db(), entry.error_text())
+        let seen = entry.validation_psnr_db().map_or(String::new(), |psnr| format!("  validation {psnr:.2} dB"));
+        format!("loss {total:.5}  PSNR {:.2} dB{seen}  {}{back}", entry.psnr_db(), entry.error_text())
     }
 }
 
