@@ -64,6 +64,8 @@ pub enum Error {
         "the model uses the parameter `{name}`, which `parameters()` of its warp or field does not list: it would stay 0"
     )]
     UnlistedParameter { name: String },
+    #[error("stopped before everything was measured")]
+    Stopped,
     #[error("`{what}` is not finite after step {step}; the last checkpoint is unharmed")]
     NotFinite { what: String, step: usize },
     #[error(
@@ -88,6 +90,7 @@ impl Error {
             | Error::Compile(_)
             | Error::Run(_)
             | Error::DeviceFailed { .. }
+            | Error::Stopped
             | Error::NotFinite { .. } => false,
             _ => true,
         }

@@ -11,15 +11,15 @@
 
 use crate::Error;
 use crate::config::{ConfigError, DeviceChoice, Layered, Origin, Precision};
+use crate::estimate::Estimate;
 use crate::evaluation::Lpips;
 use crate::planar::{PlanarData, Trainer};
 use crate::radiance::data::START;
 use crate::radiance::{Explorer, SpaceData};
-use crate::report::median;
 use crate::run::checkpoint::Checkpoint;
 use crate::run::metrics::{Entry, Metrics};
 use crate::run::{FolderError, RunFolder};
-use crate::training::{Training, due};
+use crate::training::{Training, Watch, due};
 use crate::warps::{self, Warp};
 use raygrad_runtime::{Device, DeviceError};
 use std::path::{Path, PathBuf};
@@ -43,8 +43,10 @@ pub struct Experiment {
 pub struct Outcome {
     pub metrics: Metrics,
     pub folder: PathBuf,
-    /// Whether it was stopped before its last step; it can be resumed.
+    /// Whether it was stopped before its results were written; it can be resumed.
     pub interrupted: bool,
+    /// Whether all steps were taken.
+    pub trained: bool,
     /// The headline numbers of a finished run, as lines of text.
     pub summary: String,
 }
@@ -55,8 +57,8 @@ pub trait Observer {
     fn loading(&self) -> Box<dyn Fn(usize, usize) + Sync> {
         Box::new(|_, _| {})
     }
-    /// How long the steps that are left should take on this device, by its name, in seconds.
-    fn expected(&mut self, _seconds: f64, _device: &str) {}
+    /// How long what is left should take on this device, by its name.
+    fn expected(&mut self, _estimate: &Estimate, _device: &str) {}
     /// The run begins, or goes on, after `done` of `steps` steps.
     fn begin(&mut self, _folder: &Path, _done: usize, _steps: usize) {}
     /// A step was submitted.
@@ -235,7 +237,7 @@ impl Experiment {
         Ok(device.with_precision(precision.into())?)
     }
 
-    /// Trains until the last step is done or `stop` is set, which ends the run with a checkpoint.
+    /// Trains until the last step is done and the results are written, or `stop` is set, which ends the run with a checkpoint.
     pub fn train_observed(&self, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<Outcome, Error> {
         self.layered.validate()?;
         let settings = &self.layered.settings;
@@ -254,7 +256,7 @@ impl Experiment {
         } else {
             match folder.start(settings) {
                 // Nobody asked for this folder, and another run has taken it meanwhile.
-                Err(FolderError::Occupied { .. }) if self.out.is_none() => {
+                Err(FolderError::Occupied { .. } | FolderError::InUse { .. }) if self.out.is_none() => {
                     path = self.folder();
                     folder = RunFolder::claim(&path, settings)?;
                     folder.start(settings)?;
@@ -264,23 +266,25 @@ impl Experiment {
             trainer.write_data(&folder)?;
         }
         folder.keep();
-        let left = settings.optim.taken().saturating_sub(trainer.steps_done());
-        if left >= TRIED {
-            let seconds = seconds_per_step(&mut *trainer)?;
-            observer.expected(seconds * left as f64, &trainer.learner().device_name());
+        if let Some(estimate) = Estimate::of(&mut *trainer, settings)? {
+            observer.expected(&estimate, &trainer.learner().device_name());
         }
         run.begun = Instant::now();
         observer.begin(&path, trainer.steps_done(), settings.optim.taken());
-        let interrupted = self.run_steps(&mut run, &mut *trainer, &folder, observer, stop)?;
-        if !interrupted {
+        let trained = !self.run_steps(&mut run, &mut *trainer, &folder, observer, stop)?;
+        if trained {
             observer.finishing();
             let Run { metrics, seconds, begun, .. } = &mut run;
             let elapsed = || *seconds + begun.elapsed().as_secs_f64();
-            trainer.finish(&folder, &self.layered, metrics, &elapsed)?;
+            match trainer.finish(&folder, &self.layered, metrics, &elapsed, Watch::new(&|_, _| {}, stop)) {
+                Err(Error::Stopped) => metrics.last = None,
+                other => other?,
+            }
         }
+        let interrupted = run.metrics.last.is_none();
         let summary = run.metrics.last.as_ref().map_or(String::new(), |last| trainer.summary(last));
         folder.write("metrics.json", run.metrics.to_json().as_bytes())?;
-        Ok(Outcome { metrics: run.metrics, folder: path, interrupted, summary })
+        Ok(Outcome { metrics: run.metrics, folder: path, interrupted, trained, summary })
     }
 
     /// The steps that are left; whether they were cut short. A device that is lost takes with it what was learnt since the
@@ -335,32 +339,6 @@ impl Experiment {
         }
         Ok(false)
     }
-}
-
-/// Runs of fewer steps are not timed before they begin.
-const TRIED: usize = 50;
-/// Steps that are timed, or fewer if they take longer than so many seconds.
-const TIMED: usize = 5;
-const TRIAL: f64 = 1.0;
-
-/// Seconds that a step takes, by taking a few and going back to where they began.
-fn seconds_per_step(trainer: &mut dyn Training) -> Result<f64, Error> {
-    let (step, tensors) = (trainer.steps_done(), trainer.tensors()?);
-    let begun = Checkpoint { step, seconds: 0.0, steps: vec![], tensors };
-    let mut one = || -> Result<f64, Error> {
-        let start = Instant::now();
-        trainer.step()?;
-        trainer.wait()?;
-        Ok(start.elapsed().as_secs_f64())
-    };
-    // The first one warms up.
-    one()?;
-    let mut times = vec![];
-    while times.len() < TIMED && times.iter().sum::<f64>() < TRIAL {
-        times.push(one()?);
-    }
-    trainer.restore(&begun)?;
-    Ok(median(&times))
 }
 
 /// What accumulates over a run.

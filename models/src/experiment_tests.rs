@@ -2,9 +2,10 @@
 
 use super::*;
 use crate::config::Layered;
+use crate::estimate::Trial;
 use crate::evaluation::Evaluation;
 use crate::run::Final;
-use crate::training::Learner;
+use crate::training::{Learner, Watch};
 use raygrad_runtime::{ProgramId, RunError};
 
 /// A training whose device is lost at some step.
@@ -48,8 +49,8 @@ impl Training for Losing {
     fn write_frame(&mut self, folder: &RunFolder) -> Result<(), Error> {
         self.inner.write_frame(folder)
     }
-    fn write_evaluation(&mut self, folder: &RunFolder, progress: &dyn Fn(usize, usize)) -> Result<Evaluation, Error> {
-        self.inner.write_evaluation(folder, progress)
+    fn write_evaluation(&mut self, folder: &RunFolder, watch: Watch) -> Result<Evaluation, Error> {
+        self.inner.write_evaluation(folder, watch)
     }
     fn finish(
         &mut self,
@@ -57,12 +58,37 @@ impl Training for Losing {
         layered: &Layered,
         metrics: &mut Metrics,
         seconds: &dyn Fn() -> f64,
+        watch: Watch,
     ) -> Result<(), Error> {
-        self.inner.finish(folder, layered, metrics, seconds)
+        self.inner.finish(folder, layered, metrics, seconds, watch)
+    }
+    fn trial(&mut self) -> Result<Trial, Error> {
+        Ok(Trial { frame: 1e4, evaluation: 7.0 })
     }
     fn summary(&self, last: &Final) -> String {
         self.inner.summary(last)
     }
+}
+
+#[test]
+fn what_a_run_should_take_has_its_frames_and_its_evaluation() {
+    let mut experiment = Experiment::preset("planar-barf-small").unwrap();
+    for set in ["data.image_size=[24,32]", "data.patch_crop=[12,16]", "data.points_per_patch=8", "run.device=cpu"] {
+        experiment = experiment.set(set).unwrap();
+    }
+    let mut of = |steps: usize, every: usize| {
+        for set in [format!("optim.steps={steps}"), format!("run.picture_every={every}")] {
+            experiment.layered.set(&set).unwrap();
+        }
+        let mut training = Losing { inner: experiment.training().unwrap(), at: usize::MAX };
+        Estimate::of(&mut training, &experiment.layered.settings).unwrap()
+    };
+    // The frames of these take hours.
+    let estimate = of(60, 20).unwrap();
+    assert_eq!(estimate.evaluation, 7.0);
+    assert!(estimate.training > 3e4 && estimate.total() == estimate.training + 7.0, "{estimate:?}");
+    assert!(of(60, 0).unwrap().training < 1e4);
+    assert_eq!(of(20, 0), None);
 }
 
 struct Silent;

@@ -32,6 +32,7 @@
 pub mod config;
 pub mod data;
 mod error;
+mod estimate;
 pub mod evaluation;
 mod experiment;
 pub mod fields;
@@ -48,6 +49,7 @@ pub mod training;
 pub mod warps;
 
 pub use error::Error;
+pub use estimate::{Estimate, Trial};
 pub use experiment::{Experiment, Observer, Outcome, Quiet, open_device};
 pub use raygrad_runtime::Device;
 

@@ -4,7 +4,7 @@ use crate::Error;
 use crate::config::{Sweep, SweepCell};
 use crate::evaluation::{Evaluation, PublishedTable, Table, published_for};
 use crate::run::checkpoint::MANIFEST;
-use crate::run::{FolderError, Metrics, RunFolder};
+use crate::run::{Metrics, RunFolder};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -34,22 +34,13 @@ impl SweepCell {
             RunFolder::claim(&path, settings)?;
             return Ok(Progress::Open);
         }
-        RunFolder::reopen(&path, settings)?;
+        RunFolder::check(&path, settings)?;
         // Written last of all, with what the run has come to.
         let ended = read::<Metrics>(&path.join("metrics.json")).is_some_and(|m| m.last.is_some());
         match read::<Evaluation>(&path.join("evaluation.json")) {
             Some(evaluation) if ended => Ok(Progress::Done(Box::new(evaluation))),
             _ if path.join(MANIFEST).exists() => Ok(Progress::Begun),
             _ => Ok(Progress::Open),
-        }
-    }
-
-    /// Takes away what a run left that was killed before its first checkpoint, so that it can begin anew.
-    pub fn clear(&self, sweep: &Path) -> Result<(), Error> {
-        let path = self.folder(sweep);
-        match path.exists() {
-            true => Ok(std::fs::remove_dir_all(&path).map_err(|source| FolderError::Access { path, source })?),
-            false => Ok(()),
         }
     }
 

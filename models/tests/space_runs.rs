@@ -1,6 +1,8 @@
 //! Runs in space from start to end, on the built-in scene at a size for a test.
 
-use raygrad::{Experiment, Observer, Quiet};
+use raygrad::run::{Entry, RunFolder};
+use raygrad::training::{Training, Watch};
+use raygrad::{Error, Experiment, Observer, Quiet};
 use serde_json::Value;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -90,6 +92,98 @@ fn searches_that_find_no_lost_camera_leave_a_run_as_it_is() {
         std::fs::read(run.join(format!("checkpoint-{STEPS:07}.safetensors"))).unwrap()
     };
     assert!(bits(0) == bits(3));
+}
+
+#[test]
+fn the_time_of_an_evaluation_counts_views_and_refinement() {
+    let dir = tempfile::tempdir().unwrap();
+    let trial = |set: &[&str]| tiny(set, &dir.path().join("run")).explorer().unwrap().trial().unwrap();
+    let known = trial(&["warp.method=none", "scene.poses=truth"]);
+    assert!(known.frame > 0.0 && known.evaluation == 2.0 * known.frame, "{known:?}");
+    // Two views, before and after the refinement of their poses.
+    let found = trial(&[]);
+    assert!(found.evaluation > 4.0 * found.frame, "{found:?}");
+}
+
+#[test]
+fn an_alignment_that_cameras_do_not_determine_is_told() {
+    let dir = tempfile::tempdir().unwrap();
+    for (views, told) in [(2, true), (5, false)] {
+        let run = dir.path().join(views.to_string());
+        let outcome = tiny(&[&format!("scene.train_views={views}")], &run).train().unwrap();
+        let says = |text: &str| text.contains("lie in one point or on one line");
+        assert_eq!(says(&outcome.summary), told, "{}", outcome.summary);
+        assert_eq!(says(&std::fs::read_to_string(run.join("report.html")).unwrap()), told);
+        let evaluation = std::fs::read_to_string(run.join("evaluation.json")).unwrap();
+        assert_eq!(evaluation.contains("\"undetermined\": true"), told, "{evaluation}");
+    }
+}
+
+#[test]
+fn a_validation_view_is_looked_at_and_changes_nothing() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = |name: &str, every: usize| {
+        let folder = dir.path().join(name);
+        let outcome = tiny(&[&format!("train.validate_every={every}")], &folder).train().unwrap();
+        let bits = std::fs::read(folder.join(format!("checkpoint-{STEPS:07}.safetensors"))).unwrap();
+        let report = std::fs::read_to_string(folder.join("report.html")).unwrap();
+        (outcome.metrics.steps, bits, report.contains("validation view"))
+    };
+    let (without, with) = (run("without", 0), run("with", 8));
+    let seen = |steps: &[Entry]| -> Vec<bool> { steps.iter().map(|e| e.validation_psnr_db().is_some()).collect() };
+    assert_eq!((seen(&without.0), without.2), (vec![false; 3], false));
+    assert_eq!((seen(&with.0), with.2), (vec![false, true, false], true));
+    assert!(with.1 == without.1);
+    // Against the frame of the animation, which is of the same view, rounded to bytes.
+    let explorer = tiny(&[], dir.path()).explorer().unwrap();
+    let photo = explorer.data.scene.val[0].rgb();
+    let again = tiny(&["train.validate_every=12", "run.picture_every=12"], &dir.path().join("frame")).train().unwrap();
+    let frame = image::open(dir.path().join("frame/frames/0000012.png")).unwrap().to_rgb8();
+    let squares = frame.as_raw().iter().zip(&photo).map(|(a, b)| (f64::from(*a) / 255.0 - f64::from(*b)).powi(2));
+    let psnr = -10.0 * (squares.sum::<f64>() / photo.len() as f64).log10();
+    let found = again.metrics.steps.last().unwrap().validation_psnr_db().unwrap();
+    assert!((found - psnr).abs() < 0.1, "{found} {psnr}");
+    let error = tiny(&["train.validate_every=6"], dir.path()).train().unwrap_err().to_string();
+    assert!(error.contains("`train.validate_every`") && error.contains("multiple of `run.log_every`, 4"), "{error}");
+}
+
+/// Stops a run once all steps are taken.
+struct StopAtEnd<'a>(&'a AtomicBool);
+
+impl Observer for StopAtEnd<'_> {
+    fn finishing(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
+#[test]
+fn a_run_that_is_stopped_while_it_is_measured_goes_on_from_there() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = dir.path().join("run");
+    let stop = AtomicBool::new(false);
+    let outcome = tiny(&[], &run).train_observed(&mut StopAtEnd(&stop), &stop).unwrap();
+    assert!(outcome.interrupted && outcome.trained && outcome.metrics.last.is_none());
+    assert!(run.join("metrics.json").exists() && !run.join("evaluation.json").exists());
+    let mut explorer = Experiment::of_run(&run).unwrap().restored_explorer().unwrap();
+    let folder = RunFolder::open(&run).unwrap();
+    // Between two views.
+    let stop = AtomicBool::new(false);
+    let after_one = |done, _| stop.store(done == 1, Ordering::Relaxed);
+    let stopped = explorer.write_evaluation(&folder, Watch::new(&after_one, &stop));
+    assert!(matches!(stopped, Err(Error::Stopped)), "{stopped:?}");
+    assert!(run.join("test/000.png").exists() && !run.join("test/001.png").exists());
+    assert!(!run.join("evaluation.json").exists());
+    // Within one.
+    let view = explorer.data.scene.test[0].clone();
+    let watch = Watch::new(&|_, _| {}, &stop);
+    let pose = view.pose.unwrap();
+    assert!(matches!(explorer.render(&pose, &view.intrinsics, watch), Err(Error::Stopped)));
+    assert!(matches!(explorer.refined(&pose, &view, 3, watch), Err(Error::Stopped)));
+    let measured = explorer.write_evaluation(&folder, Watch::none()).unwrap();
+    let outcome = tiny(&[], &run).resume(true).train().unwrap();
+    assert!(!outcome.interrupted && run.join("report.html").exists());
+    let written = std::fs::read_to_string(run.join("evaluation.json")).unwrap();
+    assert_eq!(written, measured.to_json());
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Before it begins, a run takes a few steps to tell how long it should take. Nothing of them must remain.
 
-use raygrad::{Experiment, Observer};
+use raygrad::{Estimate, Experiment, Observer};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
@@ -24,20 +24,21 @@ fn in_space(out: &Path) -> Experiment {
 }
 
 #[derive(Default)]
-struct Estimate(Option<f64>);
+struct Told(Option<Estimate>);
 
-impl Observer for Estimate {
-    fn expected(&mut self, seconds: f64, device: &str) {
+impl Observer for Told {
+    fn expected(&mut self, estimate: &Estimate, device: &str) {
         assert_eq!(device, "CPU, 1 threads");
-        self.0 = Some(seconds);
+        self.0 = Some(*estimate);
     }
 }
 
 /// A run with an estimate, against its own steps taken one by one without one.
 fn check(experiment: &Experiment, folder: &Path) {
-    let mut estimate = Estimate::default();
-    let outcome = experiment.train_observed(&mut estimate, &AtomicBool::new(false)).unwrap();
-    assert!(estimate.0.is_some_and(|s| s > 0.0 && s.is_finite()), "{:?}", estimate.0);
+    let mut told = Told::default();
+    let outcome = experiment.train_observed(&mut told, &AtomicBool::new(false)).unwrap();
+    let Estimate { training, evaluation } = told.0.unwrap();
+    assert!([training, evaluation].iter().all(|s| *s > 0.0 && s.is_finite()), "{training} {evaluation}");
     let first = std::fs::read(folder.join("frames/0000000.png")).unwrap();
 
     let other = tempfile::tempdir().unwrap();

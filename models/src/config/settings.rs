@@ -101,6 +101,8 @@ pub struct TrainSettings {
     pub refine_steps: usize,
     /// Steps between two searches for lost cameras; 0 for none.
     pub relocalise_every: usize,
+    /// Steps between two looks at a validation view; 0 for none.
+    pub validate_every: usize,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

@@ -58,14 +58,19 @@ impl Sweep {
         let names: Vec<&str> = bases.iter().map(|b| b.name.as_str()).collect();
         let of_preset = |layered: Layered| rest.iter().try_fold(layered, |l, leaf| set(l, leaf, &names));
         let bases = bases.iter().cloned().map(of_preset).collect::<Result<Vec<Layered>, _>>()?;
+        let scenes = values(list("scenes"), "the names of folders or photos", Value::is_str)?;
+        let seeds = values(list("seeds"), "whole numbers", Value::is_integer)?;
+        let place = |n: usize| [n / (bases.len() * seeds.len()), n / seeds.len() % bases.len(), n % seeds.len()];
         let mut cells: Vec<SweepCell> = vec![];
-        for scene in values(list("scenes"), "the names of folders or photos", Value::is_str)? {
+        for scene in &scenes {
             for base in &bases {
-                for seed in values(list("seeds"), "whole numbers", Value::is_integer)? {
-                    let cell = cell(base, scene.clone(), seed)?;
-                    if cells.iter().any(|c| c.name == cell.name) {
+                for seed in &seeds {
+                    let cell = cell(base, scene.clone(), seed.clone())?;
+                    if let Some(first) = cells.iter().position(|c| c.name == cell.name) {
+                        let (first, second) = (place(first), place(cells.len()));
+                        let twice = (0..3).find(|i| first[*i] != second[*i]).map(|i| ["scenes", "presets", "seeds"][i]);
                         let message = format!("two runs would be called `{}`", cell.name);
-                        return Err(refuse(presets, message));
+                        return Err(refuse(twice.and_then(list).unwrap_or(presets), message));
                     }
                     cells.push(cell);
                 }
@@ -215,7 +220,18 @@ mod tests {
             ("presets = [\"barf-smal\"]\n", &["grid.toml:1: `presets`", "did you mean `barf-small`?"]),
             ("presets = [\"mine.toml\"]\n", &["grid.toml:1: `presets`", "mine.toml"]),
             ("presets = [\"barf-small\", \"planar-l2g\"]\n", &["grid.toml:1: `presets`", "do not compare"]),
-            ("presets = [\"barf-small\", \"barf-small\"]\n", &["two runs would be called `builtin-barf-small-s0`"]),
+            (
+                "seeds = [1]\npresets = [\"barf-small\", \"barf-small\"]\n",
+                &["grid.toml:2: `presets`: two runs would be called `builtin-barf-small-s1`"],
+            ),
+            (
+                "presets = [\"barf-small\", \"l2g-small\"]\nseeds = [1, 0, 1]\n",
+                &["grid.toml:2: `seeds`: two runs would be called `builtin-barf-small-s1`"],
+            ),
+            (
+                "seeds = [1]\npresets = [\"barf-small\"]\nscenes = [\"builtin\", \"builtin\"]\n",
+                &["grid.toml:3: `scenes`: two runs would be called `builtin-barf-small-s1`"],
+            ),
             ("presets = [\"barf-small\"]\nseeds = [0, \"x\"]\n", &["grid.toml:2: `seeds`", "whole numbers"]),
             ("presets = [\"barf-small\"]\nseeds = [-1]\n", &["grid.toml:2: `run.seed`", "0 to 4294967295"]),
             ("presets = [\"barf-small\"]\nseed = [0]\n", &["grid.toml:2: unknown key `seed`", "did you mean `seeds`?"]),

@@ -126,6 +126,11 @@ impl Layered {
             let text = format!("expected at most {MOST_CELLS} cells along a side, found {}", train.error_map);
             return Err(self.refuse("train.error_map", text));
         }
+        if !train.validate_every.is_multiple_of(s.run.log_every.max(1)) {
+            let (every, found) = (s.run.log_every, train.validate_every);
+            let text = format!("expected a multiple of `run.log_every`, {every}, as it is logged; found {found}");
+            return Err(self.refuse("train.validate_every", text));
+        }
         if s.warp.method != Method::None && s.warp.dof != Dof::Pose {
             return Err(
                 self.refuse("warp.dof", format!("a camera has 6 degrees of freedom, found {}", s.warp.dof.count()))

@@ -25,6 +25,8 @@ pub enum Metric {
     PatchPsnrDb,
     /// In the plane: 1 where the corner error is below [`success_px`], else 0; over several runs, their share.
     Success,
+    /// Between the surface and a reference, the mean of both directions, in the unit of the scene's files.
+    Chamfer,
 }
 
 /// Corner error in pixels below which patches count as registered: 5 in a picture of 360 x 480 (INN's supplement), and as
@@ -34,7 +36,7 @@ pub fn success_px(height: usize, width: usize) -> f64 {
 }
 
 impl Metric {
-    pub const ALL: [Metric; 12] = [
+    pub const ALL: [Metric; 13] = [
         Metric::RotationErrorDeg,
         Metric::TranslationErrorX100,
         Metric::PsnrDb,
@@ -47,6 +49,7 @@ impl Metric {
         Metric::CornerErrorPx,
         Metric::PatchPsnrDb,
         Metric::Success,
+        Metric::Chamfer,
     ];
 
     /// Its name in files.
@@ -64,6 +67,7 @@ impl Metric {
             Metric::CornerErrorPx => "corner_error_px",
             Metric::PatchPsnrDb => "patch_psnr_db",
             Metric::Success => "success",
+            Metric::Chamfer => "chamfer",
         }
     }
 
@@ -82,6 +86,7 @@ impl Metric {
             Metric::CornerErrorPx => "corner error (px)",
             Metric::PatchPsnrDb => "patch PSNR (dB)",
             Metric::Success => "success (share)",
+            Metric::Chamfer => "Chamfer distance",
         }
     }
 
@@ -100,7 +105,7 @@ impl Metric {
     }
 
     /// Whether it is of test views, and so differs before and after refinement of their poses; the others are of the
-    /// training cameras or patches.
+    /// training cameras or patches, or of the model as a whole.
     pub fn is_of_views(self) -> bool {
         use Metric::{DepthError, Lpips, MaskedLpips, MaskedPsnrDb, MaskedSsim, PsnrDb, Ssim};
         matches!(self, PsnrDb | Ssim | Lpips | MaskedPsnrDb | MaskedSsim | MaskedLpips | DepthError)
@@ -135,6 +140,8 @@ pub struct Scores {
     pub patch_psnr_db: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub success: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub chamfer: Option<f64>,
 }
 
 impl Scores {
@@ -152,6 +159,7 @@ impl Scores {
             Metric::CornerErrorPx => self.corner_error_px,
             Metric::PatchPsnrDb => self.patch_psnr_db,
             Metric::Success => self.success,
+            Metric::Chamfer => self.chamfer,
         }
     }
 
@@ -174,6 +182,7 @@ impl Scores {
             corner_error_px: of(Metric::CornerErrorPx),
             patch_psnr_db: of(Metric::PatchPsnrDb),
             success: of(Metric::Success),
+            chamfer: of(Metric::Chamfer),
         }
     }
 }
@@ -225,7 +234,8 @@ pub struct Evaluation {
     pub scene: String,
     pub method: String,
     /// Pose errors of the training cameras, or corner errors of the patches of a picture; empty where there is no reference
-    /// to compare with.
+    /// to compare with. The mean also has what is of the model as a whole: whether patches are registered, and the Chamfer
+    /// distance of the surface.
     pub cameras: Measured,
     /// Test views at the poses the alignment gives.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -233,6 +243,10 @@ pub struct Evaluation {
     /// Test views after test-time refinement.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub after: Option<Measured>,
+    /// Whether the camera centres leave the alignment open, see
+    /// [`Similarity::is_ill_conditioned`](super::Similarity::is_ill_conditioned).
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub undetermined: bool,
 }
 
 impl Evaluation {
@@ -240,6 +254,14 @@ impl Evaluation {
     pub fn to_json(&self) -> String {
         // Numbers, strings and lists always have a JSON form.
         serde_json::to_string_pretty(self).unwrap_or_default()
+    }
+
+    /// What is to be said wherever the numbers are shown.
+    pub fn note(&self) -> Option<&'static str> {
+        self.undetermined.then_some(
+            "the camera centres, found or true, lie in one point or on one line, which does not determine the turn that \
+             aligns them: errors of poses and test views mean little",
+        )
     }
 
     /// The views of a stage.
@@ -274,11 +296,11 @@ mod tests {
         let all: Scores = serde_json::from_str(
             r#"{"rotation_error_deg": 1, "translation_error_x100": 2, "psnr_db": 3,
                 "ssim": 4, "lpips": 5, "masked_psnr_db": 6, "masked_ssim": 7, "masked_lpips": 8, "depth_error": 9,
-                "corner_error_px": 10, "patch_psnr_db": 11, "success": 12}"#,
+                "corner_error_px": 10, "patch_psnr_db": 11, "success": 12, "chamfer": 13}"#,
         )
         .unwrap();
         let values: Vec<f64> = Metric::ALL.iter().filter_map(|m| all.get(*m)).collect();
-        assert_eq!(values, (1..=12).map(f64::from).collect::<Vec<_>>());
+        assert_eq!(values, (1..=13).map(f64::from).collect::<Vec<_>>());
         let json = serde_json::to_value(all).unwrap();
         assert!(Metric::ALL.iter().all(|m| json.get(m.key()).is_some()));
     }

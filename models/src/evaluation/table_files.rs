@@ -25,7 +25,18 @@ impl Table {
         if rows.iter().any(|r| !r.verified) {
             out += &format!("{NOTE}\n");
         }
+        self.notes().iter().for_each(|note| out += &format!("{note}\n"));
         out
+    }
+
+    /// What is to be said of runs, once for all seeds.
+    fn notes(&self) -> Vec<String> {
+        let mut notes: Vec<String> = vec![];
+        for run in &self.evaluations {
+            let note = run.note().map(|note| format!("{} on {}: {note}", run.method, run.scene));
+            notes.extend(note.filter(|n| !notes.contains(n)));
+        }
+        notes
     }
 
     /// Comma-separated, with a head line. Where any cell is of several runs, each column is followed by its spread.
@@ -110,6 +121,7 @@ impl Table {
         if rows.iter().any(|r| !r.verified) {
             out += &format!("% {NOTE}\n");
         }
+        self.notes().iter().for_each(|note| out += &format!("% {note}\n"));
         out
     }
 
@@ -186,6 +198,7 @@ mod tests {
         let camera = Scores { rotation_error_deg: Some(degrees), ..Scores::default() };
         let picture = |psnr_db| Scores { psnr_db: Some(psnr_db), ..Scores::default() };
         Evaluation {
+            undetermined: false,
             scene: scene.into(),
             method: method.into(),
             cameras: Measured::new(vec![view("cam, 1", camera)]),
@@ -241,11 +254,23 @@ mod tests {
         assert!(csv.starts_with("metric,stage,method,source,verified,fern,a_b,mean\n"), "{csv}");
         assert!(csv.contains("rotation_error_deg,,barf,\"P, T\",false,0.125,,0.125\n"), "{csv}");
         let views = table().views_csv();
-        assert!(views.contains("fern,l2g,cameras,\"cam, 1\",0.25,,,,,,,,,,,\n"), "{views}");
-        assert!(views.contains("fern,l2g,before,mean,,,21,,,,,,,,,\n"), "{views}");
+        assert!(views.contains("fern,l2g,cameras,\"cam, 1\",0.25,,,,,,,,,,,,\n"), "{views}");
+        assert!(views.contains("fern,l2g,before,mean,,,21,,,,,,,,,,\n"), "{views}");
         let latex = table().to_latex();
         assert!(latex.contains("a\\_b") && latex.contains("\\textbf{0.125}"), "{latex}");
         assert!(latex.starts_with("\\begin{tabular}{llrrr}\n") && latex.contains("\\end{tabular}"), "{latex}");
+    }
+
+    #[test]
+    fn an_alignment_that_is_not_determined_is_told_once() {
+        let one = Evaluation { undetermined: true, ..run("fern", "l2g", 0.25, [20.0; 2]) };
+        let table = Table { evaluations: vec![one.clone(), one, run("a_b", "l2g", 0.5, [20.0; 2])], ..table() };
+        for text in [table.to_text(), table.to_latex()] {
+            let told = text.lines().filter(|l| l.contains("lie in one point or on one line"));
+            let told: Vec<&str> = told.map(|l| l.trim_start_matches("% ")).collect();
+            assert!(told.len() == 1 && told[0].starts_with("l2g on fern: "), "{text}");
+        }
+        assert_eq!(serde_json::from_str::<Table>(&table.to_json()).unwrap(), table);
     }
 
     #[test]

@@ -10,7 +10,8 @@ use std::process::{Command, Stdio};
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Video {
     Mp4(PathBuf),
-    AnimatedPng(PathBuf),
+    /// With what the program said that should have made the MP4; nothing where there is no such program.
+    AnimatedPng(PathBuf, Option<String>),
 }
 
 #[derive(Debug, thiserror::Error)]
@@ -24,21 +25,16 @@ pub enum VideoError {
         .found[0], .found[1], .first[0], .first[1]
     )]
     Size { frame: usize, first: [usize; 2], found: [usize; 2] },
-    #[error("{program} failed ({status}): {message}")]
-    Encoder { program: String, status: String, message: String },
-    #[error("{program} cannot be fed: {source}")]
-    Pipe { program: String, source: std::io::Error },
     #[error(transparent)]
     Picture(#[from] PictureError),
     #[error(transparent)]
     Write(#[from] WriteError),
 }
 
-/// Writes `stem.mp4` through the ffmpeg on the search path, or `stem.png`, animated, where there is none.
+/// Writes `stem.mp4` through the ffmpeg on the search path, or `stem.png`, animated, where there is none or it fails.
 ///
 /// # Errors
-/// If there are no frames, they differ in size, or the file cannot be written; if ffmpeg is there but fails, its last
-/// words are in the message.
+/// If there are no frames, they differ in size, or the file cannot be written.
 pub fn write_video(frames: &[Canvas], rate: u32, stem: &Path) -> Result<Video, VideoError> {
     write_video_with("ffmpeg", frames, rate, stem)
 }
@@ -56,13 +52,16 @@ pub fn write_video_with(program: &str, frames: &[Canvas], rate: u32, stem: &Path
         return Err(VideoError::Size { frame, first, found: [odd.width(), odd.height()] });
     }
     let path = with_extension(stem, "mp4");
-    if encode(program, frames, rate, first, &path)? {
-        return Ok(Video::Mp4(path));
-    }
+    let failure = match encode(program, frames, rate, first, &path) {
+        Ok(()) => return Ok(Video::Mp4(path)),
+        Err(failure) => failure,
+    };
+    // What it has written of the video is none.
+    let _ = std::fs::remove_file(&path);
     let path = with_extension(stem, "png");
     let shown = (1000 / rate) as u16;
     write_atomically(&path, &animate_at(frames, shown, shown)?)?;
-    Ok(Video::AnimatedPng(path))
+    Ok(Video::AnimatedPng(path, failure))
 }
 
 /// Unlike [`Path::with_extension`] it keeps the dots of a name.
@@ -73,9 +72,9 @@ fn with_extension(stem: &Path, extension: &str) -> PathBuf {
     name.into()
 }
 
-/// Feeds the frames to the program; false if there is no such program.
-fn encode(program: &str, frames: &[Canvas], rate: u32, size: [usize; 2], path: &Path) -> Result<bool, VideoError> {
-    let pipe = |source| VideoError::Pipe { program: program.to_string(), source };
+/// Feeds the frames to the program. Of a failure, what is to be told; nothing if there is no such program.
+fn encode(program: &str, frames: &[Canvas], rate: u32, size: [usize; 2], path: &Path) -> Result<(), Option<String>> {
+    let pipe = |source: std::io::Error| Some(format!("{program} cannot be run: {source}"));
     let mut command = Command::new(program);
     command.args(["-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]);
     command.args(["-s", &format!("{}x{}", size[0], size[1]), "-r", &rate.to_string(), "-i", "-"]);
@@ -83,7 +82,7 @@ fn encode(program: &str, frames: &[Canvas], rate: u32, size: [usize; 2], path: &
     command.args(["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white", "-pix_fmt", "yuv420p"]);
     command.arg(path).stdin(Stdio::piped()).stdout(Stdio::null()).stderr(Stdio::piped());
     let mut child = match command.spawn() {
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(false),
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Err(None),
         child => child.map_err(pipe)?,
     };
     let mut input = child.stdin.take();
@@ -92,11 +91,10 @@ fn encode(program: &str, frames: &[Canvas], rate: u32, size: [usize; 2], path: &
     drop(input);
     let output = child.wait_with_output().map_err(pipe)?;
     if !output.status.success() {
-        let message = String::from_utf8_lossy(&output.stderr).trim().to_string();
-        return Err(VideoError::Encoder { program: program.to_string(), status: output.status.to_string(), message });
+        let said = String::from_utf8_lossy(&output.stderr);
+        return Err(Some(format!("{program} failed ({}): {}", output.status, said.trim())));
     }
-    fed.map_err(pipe)?;
-    Ok(true)
+    fed.map_err(pipe)
 }
 
 #[cfg(test)]
@@ -112,7 +110,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let stem = dir.path().join("novel.view");
         let video = write_video_with("no-such-program-here", &frames(), 30, &stem).unwrap();
-        assert_eq!(video, Video::AnimatedPng(dir.path().join("novel.view.png")));
+        assert_eq!(video, Video::AnimatedPng(dir.path().join("novel.view.png"), None));
         let bytes = std::fs::read(dir.path().join("novel.view.png")).unwrap();
         assert!(bytes.windows(4).any(|w| w == b"acTL"), "not animated");
     }
@@ -144,8 +142,16 @@ mod tests {
         assert_eq!(video, Video::Mp4(dir.path().join("a.mp4")));
         let expected: Vec<u8> = frames().iter().flat_map(|f| f.0.as_raw().clone()).collect();
         assert_eq!(std::fs::read(dir.path().join("a.mp4")).unwrap(), expected);
-        let fails = program("fails", "#!/bin/sh\necho no such codec >&2\nexit 3\n");
-        let error = write_video_with(&fails, &frames(), 30, &dir.path().join("b")).unwrap_err().to_string();
-        assert!(error.contains("no such codec"), "{error}");
+        // What fails half-way leaves an animated picture alone.
+        let fails =
+            program("fails", "#!/bin/sh\nfor last; do :; done\necho x > \"$last\"\necho no such codec >&2\nexit 3\n");
+        let video = write_video_with(&fails, &frames(), 30, &dir.path().join("b")).unwrap();
+        let Video::AnimatedPng(path, Some(failure)) = video else { panic!("{video:?}") };
+        assert!(failure.contains("fails failed") && failure.ends_with("no such codec"), "{failure}");
+        assert!(path == dir.path().join("b.png") && path.exists() && !dir.path().join("b.mp4").exists());
+        let locked = dir.path().join("locked");
+        std::fs::write(&locked, "no program").unwrap();
+        let video = write_video_with(locked.to_str().unwrap(), &frames(), 30, &dir.path().join("c")).unwrap();
+        assert!(matches!(&video, Video::AnimatedPng(_, Some(f)) if f.contains("cannot be run")), "{video:?}");
     }
 }

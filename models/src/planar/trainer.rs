@@ -4,13 +4,14 @@ use super::data::PlanarData;
 use super::model::{self, PlanarModel};
 use crate::Error;
 use crate::config::{Count, Layered, Settings};
+use crate::estimate::{Trial, timed};
 use crate::evaluation;
 use crate::geometry::Transform;
 use crate::pictures::View;
 use crate::run::metrics::{CornerError, Entry, Final, Measured, Metrics};
 use crate::run::{RunFolder, results};
 use crate::training::learner::psnr;
-use crate::training::{Learner, Training};
+use crate::training::{Learner, Training, Watch};
 use crate::warps::{KNOWN_TRUTH, Warp};
 use raygrad_runtime::{Device, ProgramId};
 use std::sync::Arc;
@@ -143,11 +144,8 @@ impl Training for Trainer {
     fn write_frame(&mut self, folder: &RunFolder) -> Result<(), Error> {
         results::write_frame(folder, self)
     }
-    fn write_evaluation(
-        &mut self,
-        folder: &RunFolder,
-        _progress: &dyn Fn(usize, usize),
-    ) -> Result<evaluation::Evaluation, Error> {
+    fn write_evaluation(&mut self, folder: &RunFolder, watch: Watch) -> Result<evaluation::Evaluation, Error> {
+        watch.check()?;
         let found = self.evaluate()?;
         results::write_evaluation(folder, &self.settings, &self.data.grid, &found)
     }
@@ -157,12 +155,22 @@ impl Training for Trainer {
         layered: &Layered,
         metrics: &mut Metrics,
         seconds: &dyn Fn() -> f64,
+        watch: Watch,
     ) -> Result<(), Error> {
+        watch.check()?;
         let found = self.evaluate()?;
         let warps = found.warps.iter().map(|w| std::array::from_fn(|i| w.0[(i / 3, i % 3)])).collect();
         metrics.last = Some(Final { entry: found.entry.clone(), seconds: seconds(), warps });
         results::write_evaluation(folder, &self.settings, &self.data.grid, &found)?;
         results::write_results(folder, layered, self, &found, metrics)
+    }
+    fn trial(&mut self) -> Result<Trial, Error> {
+        let frame = timed(|| self.picture(false).map(drop))?;
+        let evaluation = timed(|| {
+            self.evaluate()?;
+            self.picture(true).map(drop)
+        })?;
+        Ok(Trial { frame, evaluation })
     }
     fn summary(&self, last: &Final) -> String {
         let Measured::Planar { patch_psnr_db, corner_error_px } = &last.entry.measured else { return String::new() };

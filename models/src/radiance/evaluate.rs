@@ -1,15 +1,17 @@
 //! What a model in space is measured by: the poses of its training views after alignment, and its pictures and depths of
 //! the test views, at the poses that the alignment gives and after test-time refinement.
 
-use super::data::SpaceDataError;
+use super::data::{SpaceData, SpaceDataError};
 use super::explorer::{Explorer, Rendered};
 use crate::Error;
-use crate::config::Method;
+use crate::config::{Method, Settings};
+use crate::estimate::{Trial, timed};
 use crate::evaluation::{
     Evaluation, Lpips, Measured, Picture, Scores, Similarity, ViewScores, depth_errors, psnr, ssim,
 };
 use crate::geometry::Pose;
 use crate::scene::View;
+use crate::training::Watch;
 
 /// What was found of a model.
 #[derive(Clone, Debug)]
@@ -32,10 +34,10 @@ pub struct Seen<'a> {
     pub scale: f64,
 }
 
-/// Measures the model as it is. `show` gets every test view once, and `progress` hears how many of how many are done.
+/// Measures the model as it is. `show` gets every test view once, and `watch` hears how many of how many are done.
 pub fn evaluate(
     explorer: &mut Explorer,
-    progress: &dyn Fn(usize, usize),
+    watch: Watch,
     mut show: impl FnMut(&Seen) -> Result<(), Error>,
 ) -> Result<Found, Error> {
     let (data, lpips) = (explorer.data.clone(), explorer.lpips.clone());
@@ -44,30 +46,73 @@ pub fn evaluate(
     let cameras = data.pose_scores(&poses).map_err(SpaceDataError::from)?;
     let settings = &explorer.settings;
     let (scene, method) = (settings.scene_name(), settings.method_name().to_string());
-    // Known poses need no refinement: they are what the field was learned with.
-    let refines = settings.warp.method != Method::None && settings.train.as_ref().is_some_and(|t| t.refine_steps > 0);
-    let test: Vec<(usize, &View, Pose)> =
-        data.scene.test.iter().enumerate().filter_map(|(i, v)| Some((i, v, v.pose?))).collect();
+    let steps = refine_steps(settings);
+    let test = tested(&data);
     let (mut before, mut after) = (vec![], vec![]);
     for (done, (index, view, reference)) in test.iter().enumerate() {
-        progress(done, test.len());
+        watch.done(done, test.len());
         let score = |rendered: &Rendered| -> Result<ViewScores, Error> {
             let scores = scores(rendered, view, similarity.scale, lpips.as_deref())?;
             Ok(ViewScores { view: view.name.clone(), scores })
         };
         let pose = similarity.to_learned(reference);
-        let mut rendered = explorer.render(&pose, &view.intrinsics)?;
+        let mut rendered = explorer.render(&pose, &view.intrinsics, watch)?;
         before.push(score(&rendered)?);
-        if refines {
-            let refined = explorer.refined(&pose, view)?;
-            rendered = explorer.render(&refined, &view.intrinsics)?;
+        if steps > 0 {
+            let refined = explorer.refined(&pose, view, steps, watch)?;
+            rendered = explorer.render(&refined, &view.intrinsics, watch)?;
             after.push(score(&rendered)?);
         }
         show(&Seen { index: *index, view, rendered, scale: similarity.scale })?;
     }
     let measured = |views: Vec<ViewScores>| (!views.is_empty()).then(|| Measured::new(views));
-    let evaluation = Evaluation { scene, method, cameras, before: measured(before), after: measured(after) };
+    let (before, after, undetermined) = (measured(before), measured(after), similarity.is_ill_conditioned());
+    let evaluation = Evaluation { scene, method, cameras, before, after, undetermined };
     Ok(Found { evaluation, poses, similarity })
+}
+
+/// Steps of the refinement of a test pose. Known poses need none: they are what the field was learned with.
+fn refine_steps(settings: &Settings) -> usize {
+    let steps = settings.train.as_ref().map_or(0, |t| t.refine_steps);
+    if settings.warp.method == Method::None { 0 } else { steps }
+}
+
+/// The test views that are measured, with their numbers and true poses.
+fn tested(data: &SpaceData) -> Vec<(usize, &View, Pose)> {
+    data.scene.test.iter().enumerate().filter_map(|(i, v)| Some((i, v, v.pose?))).collect()
+}
+
+/// PSNR of the first validation view, seen from its true pose as test views are; nothing where that is not known.
+pub fn validate(explorer: &mut Explorer) -> Result<Option<f64>, Error> {
+    let data = explorer.data.clone();
+    let Some((view, truth)) = data.scene.val.first().and_then(|v| Some((v, v.pose?))) else { return Ok(None) };
+    let pose = explorer.learned_pose(&truth)?;
+    let seen = explorer.render(&pose, &view.intrinsics, Watch::none())?;
+    let (width, height, photo) = (view.intrinsics.width, view.intrinsics.height, view.rgb());
+    Ok(Some(psnr(&Picture::new(width, height, &seen.rgb)?, &Picture::new(width, height, &photo)?)?))
+}
+
+/// Times a part of a view, and a step of the refinement of a pose, for all that there are.
+pub fn trial(explorer: &mut Explorer) -> Result<Trial, Error> {
+    let data = explorer.data.clone();
+    let (pose, view) = (data.start.poses[0], data.scene.test.first().or(data.scene.val.first()));
+    let Some(view) = view else { return Ok(Trial { frame: 0.0, evaluation: 0.0 }) };
+    explorer.look(&pose, &view.intrinsics)?;
+    let mut part = || {
+        let mut seen = Rendered { rgb: vec![], depth: vec![], opacity: vec![] };
+        timed(|| explorer.render_part(0, &mut seen))
+    };
+    // The first one warms up.
+    part()?;
+    let frame = part()? * explorer.parts().len() as f64;
+    let steps = refine_steps(&explorer.settings);
+    let mut refined = 0.0;
+    if steps > 0 {
+        let mut refine = |steps| timed(|| explorer.refined(&pose, view, steps, Watch::none()).map(drop));
+        refine(1)?;
+        refined = refine(1)? * steps as f64 + frame;
+    }
+    Ok(Trial { frame, evaluation: (frame + refined) * tested(&data).len() as f64 })
 }
 
 fn scores(seen: &Rendered, view: &View, scale: f64, lpips: Option<&Lpips>) -> Result<Scores, Error> {

@@ -2,18 +2,20 @@
 
 use super::data::{SpaceData, SpaceDataError};
 use super::error_map;
+use super::evaluate::{trial, validate};
 use super::model::{self, RadianceModel, nothing_found};
 use super::relocalise::relocalise;
 use super::results;
 use crate::Error;
 use crate::config::{DepthSettings, Layered, Method, Settings};
+use crate::estimate::Trial;
 use crate::evaluation::{Evaluation, Lpips, Metric, Stage};
 use crate::geometry::Pose;
 use crate::run::metrics::{Entry, Final, Measured, Metrics, Relocalised};
 use crate::run::{Checkpoint, RunFolder};
 use crate::scene::{Intrinsics, View};
 use crate::training::learner::psnr;
-use crate::training::{Learner, Training, due};
+use crate::training::{Learner, Training, Watch, due};
 use crate::warps::Warp;
 use raygrad_compiler::functions::adam::Adam;
 use raygrad_runtime::{Device, ProgramId};
@@ -120,37 +122,58 @@ impl Explorer {
         Ok(rough.chunks(12).zip(found.chunks(12)).map(one).collect())
     }
 
-    /// The whole image of a camera in the learned world.
-    pub fn render(&mut self, pose: &Pose, intrinsics: &Intrinsics) -> Result<Rendered, Error> {
-        self.learner.set(model::VIEW_INTRINSICS, &lens(intrinsics))?;
-        self.set_pose(pose)?;
-        let pixels = self.data.size.pixels();
+    /// A pose of the true world in the learned one, by the poses that the last step found.
+    pub(super) fn learned_pose(&mut self, pose: &Pose) -> Result<Pose, Error> {
+        let poses = self.poses()?;
+        Ok(self.data.similarity(&poses).map_err(SpaceDataError::from)?.to_learned(pose))
+    }
+
+    /// The whole image of a camera in the learned world, unless `watch` stops it before.
+    pub fn render(&mut self, pose: &Pose, intrinsics: &Intrinsics, watch: Watch) -> Result<Rendered, Error> {
+        self.look(pose, intrinsics)?;
         let mut seen = Rendered { rgb: vec![], depth: vec![], opacity: vec![] };
-        for first in (0..pixels).step_by(self.view_pixels) {
-            self.learner.set_u32(model::VIEW_FIRST, &[first as u32])?;
-            self.learner.run(self.view)?;
-            let left = self.view_pixels.min(pixels - first);
-            let mut read = |name, width: usize| -> Result<Vec<f32>, Error> {
-                let mut values = self.learner.read(self.view, name)?;
-                values.truncate(width * left);
-                Ok(values)
-            };
-            seen.rgb.extend(read("color", 3)?);
-            seen.depth.extend(read("depth", 1)?);
-            seen.opacity.extend(read("opacity", 1)?);
+        for first in self.parts() {
+            watch.check()?;
+            self.render_part(first, &mut seen)?;
         }
         Ok(seen)
     }
 
-    /// `pose` after test-time refinement against a view's image.
-    pub fn refined(&mut self, pose: &Pose, view: &View) -> Result<Pose, Error> {
-        let steps = self.settings.train.as_ref().map_or(0, |t| t.refine_steps);
+    /// The camera of the parts that are rendered next.
+    pub(super) fn look(&mut self, pose: &Pose, intrinsics: &Intrinsics) -> Result<(), Error> {
+        self.learner.set(model::VIEW_INTRINSICS, &lens(intrinsics))?;
+        self.set_pose(pose)
+    }
+
+    /// The first pixels of the parts of an image.
+    pub(super) fn parts(&self) -> impl ExactSizeIterator<Item = usize> + use<> {
+        (0..self.data.size.pixels()).step_by(self.view_pixels)
+    }
+
+    /// Renders the part of the image from its first pixel on.
+    pub(super) fn render_part(&mut self, first: usize, seen: &mut Rendered) -> Result<(), Error> {
+        self.learner.set_u32(model::VIEW_FIRST, &[first as u32])?;
+        self.learner.run(self.view)?;
+        let left = self.view_pixels.min(self.data.size.pixels() - first);
+        let mut read = |name, width: usize| -> Result<Vec<f32>, Error> {
+            let mut values = self.learner.read(self.view, name)?;
+            values.truncate(width * left);
+            Ok(values)
+        };
+        seen.rgb.extend(read("color", 3)?);
+        seen.depth.extend(read("depth", 1)?);
+        seen.opacity.extend(read("opacity", 1)?);
+        Ok(())
+    }
+
+    /// `pose` after so many steps of test-time refinement against a view's image, unless `watch` stops it before.
+    pub fn refined(&mut self, pose: &Pose, view: &View, steps: usize, watch: Watch) -> Result<Pose, Error> {
         show(&mut self.learner, &view.intrinsics, &model::packed(view).collect::<Vec<_>>())?;
-        self.refine(pose, steps, self.settings.optim.lr_warp)
+        self.refine(pose, steps, self.settings.optim.lr_warp, watch)
     }
 
     /// `pose` refined against the image that is shown: `P Exp(twist)` with Adam on the twist, the field as it is.
-    pub(super) fn refine(&mut self, pose: &Pose, steps: usize, rate: f64) -> Result<Pose, Error> {
+    pub(super) fn refine(&mut self, pose: &Pose, steps: usize, rate: f64, watch: Watch) -> Result<Pose, Error> {
         self.set_pose(pose)?;
         for state in [model::TWIST.to_string(), format!("adam.m.{}", model::TWIST), format!("adam.v.{}", model::TWIST)]
         {
@@ -158,6 +181,7 @@ impl Explorer {
         }
         self.learner.set(model::TWIST_LR, &[rate as f32])?;
         for step in 1..=steps {
+            watch.check()?;
             let (bias1, bias2) = Adam::default().bias_corrections(step as u64);
             self.learner.set(model::TWIST_BIAS1, &[bias1 as f32])?;
             self.learner.set(model::TWIST_BIAS2, &[bias2 as f32])?;
@@ -274,11 +298,14 @@ impl Training for Explorer {
         let found = self.poses()?;
         let numbers: Vec<f64> = found.iter().flat_map(|p| p.to_rows()).collect();
         self.learner.check_finite("a pose", &numbers)?;
+        let validates = due(self.settings.train.as_ref().map_or(0, |t| t.validate_every), self.steps_done());
+        let validation_psnr_db = if validates { validate(self)? } else { None };
         let errors = self.data.pose_scores(&found).map_err(SpaceDataError::from)?.mean;
         let measured = Measured::Space {
             psnr_db: psnr(loss.get("render_fine").or(loss.get("render")).copied().unwrap_or(1.0)),
             rotation_error_deg: errors.rotation_error_deg,
             translation_error_x100: errors.translation_error_x100,
+            validation_psnr_db,
         };
         let relocalised = std::mem::take(&mut self.relocalised);
         Ok(Entry { step: self.learner.steps_done(), loss, measured, relocalised })
@@ -300,8 +327,8 @@ impl Training for Explorer {
     fn write_frame(&mut self, folder: &RunFolder) -> Result<(), Error> {
         results::write_frame(folder, self)
     }
-    fn write_evaluation(&mut self, folder: &RunFolder, progress: &dyn Fn(usize, usize)) -> Result<Evaluation, Error> {
-        Ok(results::write_evaluation(folder, self, progress)?.evaluation)
+    fn write_evaluation(&mut self, folder: &RunFolder, watch: Watch) -> Result<Evaluation, Error> {
+        Ok(results::write_evaluation(folder, self, watch)?.evaluation)
     }
     fn finish(
         &mut self,
@@ -309,14 +336,18 @@ impl Training for Explorer {
         layered: &Layered,
         metrics: &mut Metrics,
         seconds: &dyn Fn() -> f64,
+        watch: Watch,
     ) -> Result<(), Error> {
         // Of a finished run that is resumed no step was taken that could be measured.
         let entry = metrics.steps.last().cloned().map_or_else(|| self.measure(), Ok)?;
         metrics.last = Some(Final { entry, seconds: seconds(), warps: vec![] });
-        let written = results::write_evaluation(folder, self, &|_, _| {})?;
+        let written = results::write_evaluation(folder, self, watch)?;
         results::write_report(folder, layered, self, metrics, &written)?;
         self.evaluation = Some(written.evaluation);
         Ok(())
+    }
+    fn trial(&mut self) -> Result<Trial, Error> {
+        trial(self)
     }
     fn summary(&self, last: &Final) -> String {
         let (steps, time) = (last.entry.step, crate::report::duration(last.seconds));
@@ -334,6 +365,9 @@ impl Training for Explorer {
             let refined = of(Stage::After).map_or(String::new(), |v| format!(", refined {v:.0$}", metric.decimals()));
             let name = format!("test {}", metric.heading());
             text += &format!("{name:<18} {before:.0$}{refined}\n", metric.decimals());
+        }
+        if let Some(note) = self.evaluation.as_ref().and_then(Evaluation::note) {
+            text += &format!("note: {note}\n");
         }
         text + &format!("training PSNR      {:.2} dB\nsteps              {steps} in {time}\n", last.entry.psnr_db())
     }

@@ -6,6 +6,7 @@ use crate::Error;
 use crate::evaluation::{DepthStyle, anchor, inverse_depth, novel_view_path};
 use crate::pictures::Canvas;
 use crate::scene::Layout;
+use crate::training::Watch;
 
 /// Frames of the two videos.
 #[derive(Clone, Debug, Default)]
@@ -27,7 +28,7 @@ impl Explorer {
         let style = DepthStyle { scale: similarity.scale, shifted: data.scene.layout == Layout::Blender };
         let mut views = NovelViews::default();
         for (i, pose) in novel_view_path(&anchor, frames, 1.0 / similarity.scale).iter().enumerate() {
-            let seen = self.render(pose, &lens)?;
+            let seen = self.render(pose, &lens, Watch::none())?;
             views.rgb.push(Canvas::from_colors(lens.width, lens.height, &seen.rgb));
             views.depth.push(inverse_depth(lens.width, lens.height, &seen.depth, &seen.opacity, style));
             progress(i + 1, frames);

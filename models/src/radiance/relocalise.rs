@@ -14,6 +14,7 @@ use crate::Error;
 use crate::geometry::Pose;
 use crate::report::median;
 use crate::run::metrics::Relocalised;
+use crate::training::Watch;
 
 /// A camera is lost whose photo's mean squared error is so many times the median over all cameras.
 const LOST: f64 = 2.5;
@@ -47,7 +48,7 @@ pub fn relocalise(explorer: &mut Explorer) -> Result<Vec<Relocalised>, Error> {
         tried.sort_by(|a, b| a.0.total_cmp(&b.0));
         let mut best = (errors[i], poses[i]);
         for (_, place) in tried.into_iter().take(REFINED) {
-            let refined = explorer.refine(&place, STEPS, RATE)?;
+            let refined = explorer.refine(&place, STEPS, RATE, Watch::none())?;
             let error = explorer.photo_error(&refined)?;
             if error < best.0 {
                 best = (error, refined);

@@ -13,7 +13,7 @@ use crate::run::RunFolder;
 use crate::run::metrics::Metrics;
 use crate::run::results::{FRAMES, animation};
 use crate::scene::{Layout, View, stand_around};
-use crate::training::Training;
+use crate::training::{Training, Watch};
 
 /// Test views shown in the report.
 const SHOWN: usize = 6;
@@ -37,26 +37,21 @@ pub fn write_data(folder: &RunFolder, data: &SpaceData) -> Result<(), Error> {
 pub fn write_frame(folder: &RunFolder, explorer: &mut Explorer) -> Result<(), Error> {
     let scene = &explorer.data.scene;
     let Some(View { pose, intrinsics, .. }) = scene.val.first().or(scene.train.first()).cloned() else { return Ok(()) };
-    let poses = explorer.poses()?;
     let pose = match pose {
-        Some(pose) => explorer.data.similarity(&poses).map_err(SpaceDataError::from)?.to_learned(&pose),
-        None => poses[0],
+        Some(pose) => explorer.learned_pose(&pose)?,
+        None => explorer.poses()?[0],
     };
-    let seen = explorer.render(&pose, &intrinsics)?;
+    let seen = explorer.render(&pose, &intrinsics, Watch::none())?;
     let canvas = Canvas::from_colors(intrinsics.width, intrinsics.height, &seen.rgb);
     folder.write(&format!("{FRAMES}/{:07}.png", explorer.steps_done()), &canvas.to_png()?)?;
     Ok(())
 }
 
 /// Measures the model, and writes `evaluation.json`, the test views, the poses and a plot of the cameras.
-pub fn write_evaluation(
-    folder: &RunFolder,
-    explorer: &mut Explorer,
-    progress: &dyn Fn(usize, usize),
-) -> Result<Written, Error> {
+pub fn write_evaluation(folder: &RunFolder, explorer: &mut Explorer, watch: Watch) -> Result<Written, Error> {
     let shifted = explorer.data.scene.layout == Layout::Blender;
     let mut shown = vec![];
-    let found = evaluate(explorer, progress, |seen| {
+    let found = evaluate(explorer, watch, |seen| {
         let (i, lens, rendered) = (seen.index, &seen.view.intrinsics, &seen.rendered);
         let rgb = Canvas::from_colors(lens.width, lens.height, &rendered.rgb);
         folder.write(&format!("test/{i:03}.png"), &rgb.to_png()?)?;
@@ -127,6 +122,7 @@ pub fn write_report(
     let device = explorer.learner().device_name();
     let caption = "Cameras before and after: where they are taken to be (teal), where they are (purple), and the way between (red).";
     let drawings = vec![(caption, written.cameras.as_str())];
-    let report = Report { title: &layered.name, device: &device, metrics, pictures, drawings, config: &config };
+    let (title, device, note) = (layered.name.as_str(), device.as_str(), written.evaluation.note());
+    let report = Report { title, device, metrics, note, pictures, drawings, config: &config };
     Ok(folder.write("report.html", report.to_html()?.as_bytes())?)
 }

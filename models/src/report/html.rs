@@ -20,6 +20,8 @@ pub struct Report<'a> {
     pub title: &'a str,
     pub device: &'a str,
     pub metrics: &'a Metrics,
+    /// What is to be said of the numbers.
+    pub note: Option<&'a str>,
     pub pictures: Vec<Picture<'a>>,
     /// Drawings (SVG), after their captions.
     pub drawings: Vec<(&'a str, &'a str)>,
@@ -33,6 +35,7 @@ body{font:16px/1.6 system-ui,-apple-system,'Segoe UI',Roboto,sans-serif;color:#1
 main{max-width:1080px;margin:0 auto;padding:2.5rem 1.5rem 4rem}
 h1{font-size:1.9rem;line-height:1.2;margin:0 0 .2rem;letter-spacing:-.01em}
 h2{font-size:1.15rem;margin:2.6rem 0 .8rem}
+.note{color:#9a3412}
 .sub{color:#5c6470;margin:0 0 1.6rem}
 .cards{display:grid;grid-template-columns:repeat(auto-fit,minmax(150px,1fr));gap:.9rem}
 .card,figure,table,pre{background:#fff;border:1px solid #e3e6ea;border-radius:10px}
@@ -109,7 +112,8 @@ impl Report<'_> {
         ]);
         let cards =
             cards.iter().map(|(value, what)| format!("<div class=card><b>{value}</b><span>{what}</span></div>"));
-        format!("<div class=cards>{}</div>", cards.collect::<String>())
+        let note = self.note.map_or(String::new(), |note| format!("<p class=note>Note: {}.</p>", escape(note)));
+        format!("<div class=cards>{}</div>{note}", cards.collect::<String>())
     }
 
     fn plots(&self) -> Result<Vec<(&'static str, String)>, PlotError> {
@@ -129,7 +133,9 @@ impl Report<'_> {
             .map(|(name, color)| curve(name, color, 2, &|e| e.loss.get(name).copied()))
             .filter(|c| !c.points.is_empty())
             .collect();
-        let psnr = [curve("PSNR", palette[1], 2, &|e| Some(e.psnr_db()))];
+        let mut psnr = vec![curve("PSNR", palette[1], 2, &|e| Some(e.psnr_db()))];
+        let validation = curve("validation view", palette[2], 2, &Entry::validation_psnr_db);
+        psnr.extend((!validation.points.is_empty()).then_some(validation));
         let mut plots = vec![
             ("Loss terms before weighting, and their weighted sum.", plot("loss", &losses, true)?),
             ("PSNR of the rendered pixels.", plot("dB", &psnr, false)?),

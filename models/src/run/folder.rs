@@ -2,6 +2,7 @@
 
 use super::checkpoint::MANIFEST;
 use super::files::{WriteError, write_atomically};
+use super::lock::{LOCK, RunLock};
 use crate::config::{ConfigError, Count, DeviceChoice, Layered, Networks, Settings};
 use std::path::{Path, PathBuf};
 
@@ -31,6 +32,8 @@ pub enum FolderError {
         .path.display()
     )]
     CutOff { path: PathBuf },
+    #[error("the run in {} is being trained by another process; wait for it, or give another folder with `--out`", .path.display())]
+    InUse { path: PathBuf },
     #[error("nothing to resume: {} holds no checkpoint", .path.display())]
     NothingToResume { path: PathBuf },
     #[error("there is no run in {}: {lacks}", .path.display())]
@@ -48,9 +51,15 @@ pub struct RunFolder {
     /// Files written before the run began, removed likewise.
     written: std::cell::RefCell<Vec<PathBuf>>,
     kept: bool,
+    /// Of a folder that is trained into.
+    lock: Option<RunLock>,
 }
 
 impl RunFolder {
+    fn at(path: &Path, kept: bool, lock: Option<RunLock>) -> RunFolder {
+        RunFolder { path: path.to_path_buf(), made: vec![], written: Default::default(), kept, lock }
+    }
+
     /// The folder a run gets if none is asked for: `runs/NAME`, then `runs/NAME-2`, ...: the first free one, or to
     /// resume, the last that is there.
     pub fn default_path(name: &str, resume: bool) -> PathBuf {
@@ -65,6 +74,9 @@ impl RunFolder {
             match RunFolder::held_settings(path)? {
                 Some(held) => {
                     let (path, difference) = (path.to_path_buf(), difference(&held, settings));
+                    if difference.is_none() && path.join(LOCK).exists() {
+                        RunLock::take(&path)?;
+                    }
                     let cut_off = difference.is_none() && !path.join(MANIFEST).exists();
                     return Err(if cut_off {
                         FolderError::CutOff { path }
@@ -76,18 +88,24 @@ impl RunFolder {
                 None => return Err(FolderError::Foreign { path: path.to_path_buf() }),
             }
         }
-        Ok(RunFolder { path: path.to_path_buf(), made: vec![], written: Default::default(), kept: false })
+        Ok(RunFolder::at(path, false, None))
     }
 
-    /// Opens the folder of the same run again.
+    /// Opens the folder of the same run again, to train on in it.
     pub fn reopen(path: &Path, settings: &Settings) -> Result<RunFolder, FolderError> {
+        RunFolder::check(path, settings)?;
+        Ok(RunFolder::at(path, true, Some(RunLock::take(path)?)))
+    }
+
+    /// Refuses a folder that does not hold this run.
+    pub fn check(path: &Path, settings: &Settings) -> Result<(), FolderError> {
         let missing = || FolderError::NothingToResume { path: path.to_path_buf() };
         if !path.exists() {
             return Err(missing());
         }
         let held = RunFolder::held_settings(path)?.ok_or_else(missing)?;
         match difference(&held, settings) {
-            None => Ok(RunFolder { path: path.to_path_buf(), made: vec![], written: Default::default(), kept: true }),
+            None => Ok(()),
             difference => Err(FolderError::Occupied { path: path.to_path_buf(), difference }),
         }
     }
@@ -95,7 +113,34 @@ impl RunFolder {
     /// Opens the folder of a run to add to it.
     pub fn open(path: &Path) -> Result<RunFolder, FolderError> {
         RunFolder::settings_of_run(path)?;
-        Ok(RunFolder { path: path.to_path_buf(), made: vec![], written: Default::default(), kept: true })
+        Ok(RunFolder::at(path, true, None))
+    }
+
+    /// Takes away what a run left that was cut off before its first checkpoint, so that it can begin anew.
+    ///
+    /// # Errors
+    /// If it is not cut off but being trained, or its files cannot be removed.
+    pub fn clear(path: &Path) -> Result<(), FolderError> {
+        if !path.exists() {
+            return Ok(());
+        }
+        let refuse = |source| FolderError::Access { path: path.to_path_buf(), source };
+        let _lock = RunLock::take(path)?;
+        // Another process may have trained it since it was looked at.
+        if path.join(MANIFEST).exists() {
+            return Err(FolderError::Occupied { path: path.to_path_buf(), difference: None });
+        }
+        for entry in std::fs::read_dir(path).map_err(refuse)? {
+            let entry = entry.map_err(refuse)?;
+            // Without the lock file another process could make one, and have a lock of its own.
+            if entry.file_name() == LOCK {
+                continue;
+            }
+            let is_folder = entry.file_type().map_err(refuse)?.is_dir();
+            if is_folder { std::fs::remove_dir_all(entry.path()) } else { std::fs::remove_file(entry.path()) }
+                .map_err(refuse)?;
+        }
+        Ok(())
     }
 
     /// Settings of a run that has a checkpoint, named as its folder is.
@@ -143,7 +188,12 @@ impl RunFolder {
         }
         std::fs::create_dir_all(&self.path)
             .map_err(|source| FolderError::Access { path: self.path.clone(), source })?;
-        // Of two runs that claimed the folder together, the one that makes the file has it.
+        if self.lock.is_none() {
+            let is_new = !self.path.join(LOCK).exists();
+            self.lock = Some(RunLock::take(&self.path)?);
+            self.written.get_mut().extend(is_new.then(|| self.path.join(LOCK)));
+        }
+        // Of two runs that claimed the folder together, one after the other, the one that makes the file has it.
         let config = self.path.join(CONFIG);
         std::fs::OpenOptions::new().write(true).create_new(true).open(&config).map_err(|source| {
             match source.kind() == std::io::ErrorKind::AlreadyExists {
@@ -181,7 +231,7 @@ impl Drop for RunFolder {
         if self.kept {
             return;
         }
-        // Only what this run made: a failure to tidy up is no news.
+        // Only what this run made, while it still has the lock: a failure to tidy up is no news.
         for file in self.written.borrow().iter() {
             let _ = std::fs::remove_file(file);
         }
@@ -194,7 +244,7 @@ impl Drop for RunFolder {
 fn is_empty(path: &Path) -> Result<bool, FolderError> {
     let mut entries =
         std::fs::read_dir(path).map_err(|source| FolderError::Access { path: path.to_path_buf(), source })?;
-    Ok(entries.next().is_none())
+    Ok(entries.all(|e| e.is_ok_and(|e| e.file_name() == LOCK)))
 }
 
 /// The first setting in which two runs differ. Where a run computes is not part of what it is.
@@ -241,6 +291,7 @@ mod tests {
         let mut folder = RunFolder::claim(&path, &settings).unwrap();
         folder.start(&settings).unwrap();
         folder.keep();
+        drop(folder);
         let error = |r: Result<RunFolder, FolderError>| r.unwrap_err().to_string();
         let again = error(RunFolder::claim(&path, &settings));
         assert!(again.contains("cut off before its first checkpoint"), "{again}");
@@ -258,5 +309,38 @@ mod tests {
         std::fs::remove_file(path.join(CONFIG)).unwrap();
         std::fs::write(path.join("thesis.tex"), "x").unwrap();
         assert!(error(RunFolder::claim(&path, &settings)).contains("not empty"));
+    }
+    #[test]
+    fn a_run_is_trained_by_one_at_a_time() {
+        let dir = tempfile::tempdir().unwrap();
+        let settings = Layered::load("planar-l2g").unwrap().settings;
+        let path = dir.path().join("run");
+        let claim = || RunFolder::claim(&path, &settings);
+        let in_use = |r: Result<RunFolder, FolderError>| matches!(r, Err(FolderError::InUse { .. }));
+        let mut second = claim().unwrap();
+        let mut first = claim().unwrap();
+        first.start(&settings).unwrap();
+        first.keep();
+        assert!(matches!(second.start(&settings), Err(FolderError::InUse { .. })), "both claimed the folder");
+        drop(second);
+        // Before its first checkpoint a run is neither cut off nor to be cleared.
+        assert!(in_use(claim()));
+        assert!(matches!(RunFolder::clear(&path), Err(FolderError::InUse { .. })));
+        assert!(path.join(CONFIG).exists());
+        drop(first);
+        assert!(matches!(claim(), Err(FolderError::CutOff { .. })));
+        std::fs::write(path.join(MANIFEST), "").unwrap();
+        let resumed = RunFolder::reopen(&path, &settings).unwrap();
+        assert!(in_use(RunFolder::reopen(&path, &settings)) && in_use(claim()));
+        // Readers need no lock.
+        RunFolder::open(&path).unwrap();
+        drop(resumed);
+        drop(RunFolder::reopen(&path, &settings).unwrap());
+        // What has a checkpoint is never cleared.
+        assert!(matches!(RunFolder::clear(&path), Err(FolderError::Occupied { .. })));
+        std::fs::remove_file(path.join(MANIFEST)).unwrap();
+        RunFolder::clear(&path).unwrap();
+        assert!(!path.join(CONFIG).exists());
+        claim().unwrap().start(&settings).unwrap();
     }
 }

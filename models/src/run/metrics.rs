@@ -45,6 +45,9 @@ pub enum Measured {
         /// A hundred times the mean distance between estimated and true world-to-camera translations.
         #[serde(default, skip_serializing_if = "Option::is_none")]
         translation_error_x100: Option<f64>,
+        /// PSNR of the first validation view, see `train.validate_every`.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        validation_psnr_db: Option<f64>,
     },
 }
 
@@ -53,6 +56,13 @@ impl Entry {
     pub fn psnr_db(&self) -> f64 {
         match self.measured {
             Measured::Planar { patch_psnr_db: psnr, .. } | Measured::Space { psnr_db: psnr, .. } => psnr,
+        }
+    }
+    /// PSNR of the first validation view in dB, where it was looked at.
+    pub fn validation_psnr_db(&self) -> Option<f64> {
+        match self.measured {
+            Measured::Planar { .. } => None,
+            Measured::Space { validation_psnr_db, .. } => validation_psnr_db,
         }
     }
     /// Corner errors of a planar run.

@@ -3,6 +3,7 @@
 pub mod checkpoint;
 pub mod files;
 pub mod folder;
+pub mod lock;
 pub mod metrics;
 pub mod results;
 

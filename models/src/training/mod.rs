@@ -4,12 +4,15 @@
 pub mod learner;
 pub(crate) mod loss_scale;
 pub mod optimise;
+mod watch;
 
 pub use learner::Learner;
 pub use optimise::Rates;
+pub use watch::Watch;
 
 use crate::Error;
 use crate::config::Layered;
+use crate::estimate::Trial;
 use crate::evaluation::Evaluation;
 use crate::run::checkpoint::Checkpoint;
 use crate::run::metrics::{Entry, Final, Metrics};
@@ -59,19 +62,23 @@ pub trait Training {
     /// Writes one frame of the animation.
     fn write_frame(&mut self, folder: &RunFolder) -> Result<(), Error>;
 
-    /// Measures the model as it is and writes what it finds, `evaluation.json` first of all. `progress` hears how many of how
-    /// many views are done.
-    fn write_evaluation(&mut self, folder: &RunFolder, progress: &dyn Fn(usize, usize)) -> Result<Evaluation, Error>;
+    /// Measures the model as it is and writes what it finds, `evaluation.json` first of all. `watch` hears how many of how
+    /// many views are done, and may stop it.
+    fn write_evaluation(&mut self, folder: &RunFolder, watch: Watch) -> Result<Evaluation, Error>;
 
     /// Measures everything at the end of the last step into `metrics`, with the `seconds` that training took, and writes the
-    /// results.
+    /// results, unless `watch` stops it before.
     fn finish(
         &mut self,
         folder: &RunFolder,
         layered: &Layered,
         metrics: &mut Metrics,
         seconds: &dyn Fn() -> f64,
+        watch: Watch,
     ) -> Result<(), Error>;
+
+    /// Times parts of an evaluation. Parameters and states may change.
+    fn trial(&mut self) -> Result<Trial, Error>;
 
     /// The headline numbers as lines of text.
     fn summary(&self, last: &Final) -> String;

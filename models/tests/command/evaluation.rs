@@ -1,6 +1,6 @@
 //! Measuring, exporting and showing a run that is there.
 
-use crate::workplace::{Workplace, mentions, names};
+use crate::workplace::{Workplace, mentions, names, stderr};
 use raygrad::evaluation::Mesh;
 use safetensors::tensor::{Dtype, TensorView};
 use serde_json::Value;
@@ -121,6 +121,14 @@ fn a_mesh_and_its_distance_to_a_cloud() {
     assert_eq!(found["mesh"]["triangles"], mesh.triangles.len());
     let distance = found["mesh"]["chamfer"]["mean"].as_f64().unwrap();
     assert!(distance > 0.0 && distance < 2.4 / 16.0, "{distance}");
+    // It is a number of the run like any other.
+    assert_eq!(w.json("run/evaluation.json")["cameras"]["mean"]["chamfer"], distance);
+    let files = ["--cloud", "whole.ply", "--csv", "views.csv", "--latex", "table.tex"];
+    mentions(&w.succeed(&eval(&files)), &["Chamfer distance", &format!("{distance:.3}")]);
+    mentions(&std::fs::read_to_string(w.path("table.tex")).unwrap(), &["Chamfer distance", &format!("{distance:.3}")]);
+    let csv = std::fs::read_to_string(w.path("views.csv")).unwrap();
+    assert!(csv.lines().any(|l| l.contains(",cameras,mean,") && l.ends_with(&format!(",{distance}"))), "{csv}");
+    mentions(&stderr(&w.run(&["eval", "run"])), &["had a Chamfer distance", "--cloud"]);
     w.succeed(&eval(&["--mesh", "part.obj", "--mesh-bounds", "-1,1,-1,1,-0.5,0.5"]));
     let text = std::fs::read_to_string(w.path("part.obj")).unwrap();
     let height = |l: &str| l.strip_prefix("v ").and_then(|l| l.rsplit(' ').next()?.parse::<f64>().ok());
@@ -131,6 +139,12 @@ fn a_mesh_and_its_distance_to_a_cloud() {
     mentions(&refuse(&["--mesh", "no.ply", "--mesh-bounds", "1,2,3"]), &["--mesh-bounds", "found 3"]);
     mentions(&refuse(&["--cloud", "nowhere.ply"]), &["nowhere.ply"]);
     assert_eq!(w.run(&["eval", "run", "--mesh", "no.stl"]).status.code(), Some(2));
+    for option in [["--mesh-resolution", "8"], ["--mesh-threshold", "1"], ["--mesh-bounds", "-1,1"]] {
+        let output = w.run(&["eval", "run", option[0], option[1]]);
+        assert_eq!(output.status.code(), Some(2), "{option:?}");
+        mentions(&stderr(&output), &["required", "--mesh <FILE>", "--cloud <PLY>"]);
+    }
+    mentions(&w.succeed(&eval(&["--mesh", "both.ply", "--cloud", "whole.ply"])), &["both.ply", "chamfer"]);
     assert!(!w.path("no.ply").exists());
 }
 
@@ -213,4 +227,19 @@ fn runs_that_are_none() {
     std::fs::remove_file(w.path("run/checkpoint.json")).unwrap();
     mentions(&w.refuse(&["eval", "run"]), &["no run in run", "before its first checkpoint"]);
     assert_eq!(w.left_behind(), ["empty", "moved", "run"]);
+}
+
+#[test]
+fn views_that_validate_and_test_are_counted_once() {
+    let w = Workplace::new();
+    w.succeed(&["make-scene", "scene", "--views", "12", "--size", "8"]);
+    std::fs::rename(w.path("scene/transforms_train.json"), w.path("scene/transforms.json")).unwrap();
+    let text = w.succeed(&["data", "scene", "--layout", "transforms"]);
+    let line = |name: &str| text.lines().find_map(|l| l.strip_prefix(name)).unwrap().trim().to_string();
+    let views = line("views");
+    assert!(views.ends_with("(the same)"), "{text}");
+    let counts: Vec<usize> = views.split(' ').filter_map(|w| w.parse().ok()).collect();
+    let all = counts[0] + counts[2];
+    assert!(all > counts[0], "{text}");
+    assert_eq!(line("poses"), format!("{all} of {all} views"));
 }

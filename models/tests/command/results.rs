@@ -13,6 +13,7 @@ fn a_run_leaves_metrics_pictures_checkpoint_and_report() {
     let mut found = names(&w.path("run"));
     found.sort();
     let expected = [
+        ".lock",
         "checkpoint-0000012.safetensors",
         "checkpoint.json",
         "config.toml",
@@ -100,6 +101,13 @@ fn default_folders_are_numbered() {
     assert_eq!(runs, ["tiny", "tiny-2"]);
 }
 
+/// Ctrl-C.
+#[cfg(unix)]
+fn interrupt(child: &std::process::Child) {
+    let kill = std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
+    assert!(kill.success());
+}
+
 /// Stops a run by Ctrl-C, resumes it, and compares it with one that was never stopped.
 #[cfg(unix)]
 #[test]
@@ -112,8 +120,7 @@ fn an_interrupted_run_resumes_bit_by_bit() {
     // The first measurement is printed after the first step.
     let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
     assert!(lines.by_ref().map_while(Result::ok).any(|l| l.starts_with("step ")));
-    let kill = std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().unwrap();
-    assert!(kill.success());
+    interrupt(&child);
     lines.for_each(drop);
     assert_eq!(child.wait().unwrap().code(), Some(130));
     let done = w.json("parts/checkpoint.json")["step"].as_u64().unwrap();
@@ -128,6 +135,24 @@ fn an_interrupted_run_resumes_bit_by_bit() {
     assert!(tensors("parts") == tensors("whole"));
     let animation = |run: &str| std::fs::read(w.path(&format!("{run}/training.png"))).unwrap();
     assert!(animation("parts") == animation("whole"));
+}
+
+/// Stops the measuring of a run by Ctrl-C, which would last for hours.
+#[cfg(unix)]
+#[test]
+fn the_measuring_of_a_run_is_interrupted_too() {
+    let w = Workplace::in_space();
+    let args = ["train", "space.toml", "--out", "run", "--set", "train.refine_steps=100000000"];
+    let mut child = w.command(&args).stderr(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+    let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+    assert!(lines.by_ref().map_while(Result::ok).any(|l| l.starts_with("training done")));
+    interrupt(&child);
+    lines.for_each(drop);
+    let output = child.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(130));
+    mentions(&String::from_utf8_lossy(&output.stdout), &["`raygrad eval run`", "`--out run --resume`"]);
+    assert_eq!(w.json("run/checkpoint.json")["step"], 6);
+    assert!(w.json("run/metrics.json")["final"].is_null());
 }
 
 #[test]

@@ -2,6 +2,7 @@
 
 use crate::workplace::{Workplace, mentions, names, stderr};
 use raygrad::config::Sweep;
+use raygrad::run::RunFolder;
 use raygrad::{Experiment, Observer};
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -76,6 +77,38 @@ fn a_sweep_trains_all_and_goes_on_where_it_was_stopped() {
     std::fs::write(w.path("grid.toml"), text.replace("optim.steps = 10", "optim.steps = 11")).unwrap();
     mentions(&w.refuse(&["sweep", &file, "--out", "parts"]), &["another run", "there `optim.steps` is 10, here 11"]);
     assert_eq!(csv("parts"), csv("whole"));
+}
+
+#[test]
+fn runs_that_another_process_trains_are_left_alone() {
+    let w = Workplace::new();
+    let file = write_sweep(&w);
+    w.succeed(&["sweep", &file, "--out", "out"]);
+    let sweep = Sweep::load(&w.path("grid.toml")).unwrap();
+    let held = |cell: usize| {
+        let folder = w.path("out").join(&sweep.cells[cell].name);
+        RunFolder::reopen(&folder, &sweep.cells[cell].layered.settings).unwrap()
+    };
+    // One goes on from its checkpoint elsewhere, one has none yet, one is to be done.
+    let (begun, first) = (held(3), held(0));
+    for run in [begun.path(), first.path(), &w.path("out/builtin-tiny-s1")] {
+        std::fs::remove_file(run.join("metrics.json")).unwrap();
+    }
+    for file in ["checkpoint.json", "checkpoint-0000010.safetensors"] {
+        std::fs::remove_file(first.path().join(file)).unwrap();
+    }
+    let output = w.run(&["sweep", &file, "--out", "out"]);
+    assert_eq!(output.status.code(), Some(1));
+    let expected = "out/builtin-tiny-s0 is being trained by another process";
+    mentions(&stderr(&output), &[expected, "2 of 4 runs failed: builtin-tiny-s0, builtin-slow-s1"]);
+    assert!(first.path().join("config.toml").exists() && !begun.path().join("metrics.json").exists());
+    assert!(w.path("out/builtin-tiny-s1/metrics.json").exists());
+    let train = ["train", "out/builtin-slow-s1/config.toml", "--out", "out/builtin-slow-s1"];
+    mentions(&w.refuse(&[&train[..], &["--resume"]].concat()), &["is being trained by another process"]);
+    w.succeed(&["eval", "out/builtin-slow-s1"]);
+    drop((begun, first));
+    w.succeed(&["sweep", &file, "--out", "out"]);
+    assert!(w.path("out/builtin-slow-s1/metrics.json").exists());
 }
 
 #[test]

@@ -72,7 +72,9 @@ fn starts_blind(scene: &Scene) -> bool {
 fn summary(scene: &Scene) -> String {
     let mut text = String::new();
     let mut line = |name: &str, value: String| text += &format!("{name:<13} {value}\n");
-    let all: Vec<&View> = scene.train.iter().chain(&scene.val).chain(&scene.test).collect();
+    // One folder may be both.
+    let val = if scene.val == scene.test { &[][..] } else { &scene.val };
+    let all: Vec<&View> = scene.train.iter().chain(val).chain(&scene.test).collect();
     line("layout", scene.layout.to_string());
     let (train, val, test) = (scene.train.len(), scene.val.len(), scene.test.len());
     let same = if scene.val == scene.test && val > 0 { " (the same)" } else { "" };

@@ -7,14 +7,15 @@ use crate::surface::{Surface, SurfaceArgs};
 use anyhow::bail;
 use clap::Args;
 use raygrad::Error;
-use raygrad::evaluation::{Evaluation, Measured, PublishedTable, Table, published_for};
+use raygrad::evaluation::{Evaluation, Measured, Metric, PublishedTable, Table, published_for};
 use raygrad::run::RunFolder;
 use raygrad::run::files::write_atomically;
 use raygrad::scene::Layout;
-use raygrad::training::Training;
+use raygrad::training::{Training, Watch};
 use serde::Serialize;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::atomic::AtomicBool;
 
 #[derive(Args)]
 pub struct EvalArgs {
@@ -63,19 +64,25 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     }
     let folder = RunFolder::open(&args.held.run).map_err(Error::from)?;
     let settings = experiment.layered.settings.clone();
-    let had_lpips =
-        std::fs::read_to_string(folder.path().join("evaluation.json")).is_ok_and(|t| t.contains("\"lpips\""));
-    let (evaluation, step, surface, layout);
+    let earlier = std::fs::read_to_string(folder.path().join("evaluation.json")).unwrap_or_default();
+    let had = |metric: Metric| earlier.contains(&format!("\"{}\"", metric.key()));
+    // Ctrl-C ends this command at once: what it writes is written as whole files.
+    let never = AtomicBool::new(false);
+    let (mut evaluation, step, surface, layout);
     if settings.scene.is_some() || args.surface.wanted() {
         let mut explorer = experiment.restored_explorer()?;
-        evaluation = measure(&mut explorer, &folder)?;
+        evaluation = measure(&mut explorer, &folder, &never)?;
         layout = Some(explorer.data.scene.layout);
         step = explorer.steps_done();
         // Of what was measured something is told in any case.
         surface = args.surface.wanted().then(|| args.surface.run(&mut explorer, &checked)).transpose();
+        if let Some(distances) = surface.as_ref().ok().and_then(|s| s.as_ref()?.chamfer.as_ref()) {
+            evaluation.cameras.mean.chamfer = Some(distances.mean);
+            folder.write("evaluation.json", evaluation.to_json().as_bytes()).map_err(Error::from)?;
+        }
     } else {
         let mut trainer = experiment.restored()?;
-        evaluation = measure(&mut *trainer, &folder)?;
+        evaluation = measure(&mut *trainer, &folder, &never)?;
         (step, surface, layout) = (trainer.steps_done(), Ok(None), None);
     }
     let dataset = layout.map_or("planar", Layout::name);
@@ -100,8 +107,11 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     let lacks = |m: &Option<Measured>| m.as_ref().is_some_and(|m| m.mean.psnr_db.is_some() && m.mean.lpips.is_none());
-    if had_lpips && lacks(&evaluation.before) {
+    if had(Metric::Lpips) && lacks(&evaluation.before) {
         eprintln!("note: evaluation.json had LPIPS, which is measured with `--lpips` only");
+    }
+    if had(Metric::Chamfer) && evaluation.cameras.mean.chamfer.is_none() {
+        eprintln!("note: evaluation.json had a Chamfer distance, which is measured with `--cloud` only");
     }
     let mut text = table.to_text();
     if settings.scene.is_none() {
@@ -116,10 +126,10 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Measures a model and writes what it finds into its run's folder, with a bar over the views.
-pub fn measure(model: &mut dyn Training, folder: &RunFolder) -> Result<Evaluation, Error> {
+/// Measures a model and writes what it finds into its run's folder, with a bar over the views, unless `stop` is set before.
+pub fn measure(model: &mut dyn Training, folder: &RunFolder, stop: &AtomicBool) -> Result<Evaluation, Error> {
     let shown = bar("evaluating", "views");
-    let evaluation = model.write_evaluation(folder, &|done, all| shown.show(done, all));
+    let evaluation = model.write_evaluation(folder, Watch::new(&|done, all| shown.show(done, all), stop));
     shown.finish();
     evaluation
 }

@@ -1,9 +1,9 @@
 //! Progress of a run on standard error: a bar on a terminal, plain lines elsewhere.
 
 use indicatif::{ProgressBar, ProgressStyle};
-use raygrad::Observer;
 use raygrad::report::duration;
 use raygrad::run::Entry;
+use raygrad::{Estimate, Observer};
 use std::io::IsTerminal;
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -35,7 +35,8 @@ impl Progress {
         let total = entry.loss.get("total").copied().unwrap_or(0.0);
         let views: Vec<&str> = entry.relocalised.iter().map(|r| r.view.as_str()).collect();
         let back = if views.is_empty() { String::new() } else { format!("  brought back {}", views.join(", ")) };
-        format!("loss {total:.5}  PSNR {:.2} dB  {}{back}", entry.psnr_db(), entry.error_text())
+        let seen = entry.validation_psnr_db().map_or(String::new(), |psnr| format!("  validation {psnr:.2} dB"));
+        format!("loss {total:.5}  PSNR {:.2} dB{seen}  {}{back}", entry.psnr_db(), entry.error_text())
     }
 }
 
@@ -50,8 +51,9 @@ impl Observer for Progress {
         })
     }
 
-    fn expected(&mut self, seconds: f64, device: &str) {
-        let text = format!("about {} of steps on {device}", duration(seconds));
+    fn expected(&mut self, estimate: &Estimate, device: &str) {
+        let [total, training, evaluation] = [estimate.total(), estimate.training, estimate.evaluation].map(duration);
+        let text = format!("about {total} on {device}: {training} of training, {evaluation} of evaluation");
         match &self.bar {
             Some(bar) => bar.println(text),
             None => eprintln!("{text}"),

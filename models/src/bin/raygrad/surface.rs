@@ -1,7 +1,7 @@
 //! The mesh options of `raygrad eval`.
 
 use crate::progress::bar;
-use clap::Args;
+use clap::{ArgGroup, Args};
 use raygrad::Error;
 use raygrad::evaluation::{Mesh, MeshOptions, chamfer};
 use raygrad::radiance::Explorer;
@@ -13,8 +13,11 @@ use std::path::{Path, PathBuf};
 const POINTS: usize = 100_000;
 /// DTU's evaluation leaves out distances above this, in millimetres.
 const DTU_LIMIT: f64 = 20.0;
+/// The options that ask for a surface; the others say how it is made.
+const WANTED: &str = "surface";
 
 #[derive(Args)]
+#[command(group = ArgGroup::new(WANTED).args(["mesh", "cloud"]).multiple(true))]
 pub struct SurfaceArgs {
     /// Write the surface as a mesh (`.ply` or `.obj`), in the world of the scene's files.
     #[arg(long, value_name = "FILE", value_parser = mesh_file)]
@@ -23,15 +26,16 @@ pub struct SurfaceArgs {
     #[arg(long, value_name = "PLY")]
     cloud: Option<PathBuf>,
     /// Cubes along each side of the mesh's grid.
-    #[arg(long, value_name = "N", default_value_t = MeshOptions::default().points[0] - 1)]
+    #[arg(long, value_name = "N", requires = WANTED, default_value_t = MeshOptions::default().points[0] - 1)]
     mesh_resolution: usize,
     /// Density of the surface, in inverse lengths of the true world.
-    #[arg(long, value_name = "DENSITY", default_value_t = MeshOptions::default().threshold)]
+    #[arg(long, value_name = "DENSITY", requires = WANTED, default_value_t = MeshOptions::default().threshold)]
     mesh_threshold: f64,
     /// Where to look: LOW,HIGH along each axis, or three such pairs; in units of the loaded scene.
     #[arg(
         long,
         value_name = "LOW,HIGH",
+        requires = WANTED,
         value_delimiter = ',',
         allow_hyphen_values = true,
         default_value = "-1.2,1.2"
@@ -45,15 +49,15 @@ pub struct Surface {
     vertices: usize,
     triangles: usize,
     #[serde(skip_serializing_if = "Option::is_none")]
-    chamfer: Option<Distances>,
+    pub chamfer: Option<Distances>,
 }
 
 /// In the unit of the scene's files.
 #[derive(Serialize)]
-struct Distances {
+pub struct Distances {
     accuracy: f64,
     completeness: f64,
-    mean: f64,
+    pub mean: f64,
 }
 
 fn mesh_file(name: &str) -> Result<PathBuf, String> {

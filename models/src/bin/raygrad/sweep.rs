@@ -37,24 +37,24 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<ExitCode> {
     if let Some(weights) = &args.lpips {
         Lpips::load(weights).map_err(Error::from)?;
     }
-    let mut states = vec![];
+    let mut open = true;
     for cell in &sweep.cells {
-        states.push(cell.progress(&folder)?);
+        open &= cell.progress(&folder)? == Progress::Open;
     }
-    if args.resume && states.iter().all(|s| *s == Progress::Open) {
+    if args.resume && open {
         return Err(Error::from(FolderError::NothingToResume { path: folder }).into());
     }
     let stop = listen()?;
     let (mut done, mut failed) = (vec![], vec![]);
-    for (i, (cell, state)) in sweep.cells.iter().zip(states).enumerate() {
+    for (i, cell) in sweep.cells.iter().enumerate() {
         eprintln!("run {} of {}: {}", i + 1, sweep.cells.len(), cell.name);
-        match train(cell, state, &folder, args.lpips.as_deref(), &stop) {
+        match train(cell, &folder, args.lpips.as_deref(), &stop) {
             Ok(Some(evaluation)) => done.push((cell, evaluation)),
-            Ok(None) => {
+            Ok(None) | Err(Error::Stopped) => {
                 print(&format!("stopped; continue with the same command and `--out {} --resume`\n", folder.display()))?;
                 return Ok(ExitCode::from(130));
             }
-            // One run that fails, by diverging or for a damaged scene, leaves the others to be done.
+            // One run that fails, by diverging, for a damaged scene or as another process trains it, leaves the others.
             Err(error) => {
                 eprintln!("{} failed: {error}", cell.name);
                 failed.push(cell.name.as_str());
@@ -76,22 +76,22 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<ExitCode> {
 /// What a run has come to; nothing if it was stopped.
 fn train(
     cell: &SweepCell,
-    state: Progress,
     folder: &Path,
     lpips: Option<&Path>,
     stop: &AtomicBool,
 ) -> Result<Option<Evaluation>, Error> {
-    let begun = match state {
+    // As it is by now: another process may have gone on with it since the sweep began.
+    let begun = match cell.progress(folder)? {
         Progress::Done(evaluation) => {
             let lacks = evaluation.before.as_ref().is_some_and(|b| b.mean.lpips.is_none());
             return match lpips.filter(|_| lacks) {
-                Some(weights) => measured_again(&cell.folder(folder), weights).map(Some),
+                Some(weights) => measured_again(&cell.folder(folder), weights, stop).map(Some),
                 None => Ok(Some(*evaluation)),
             };
         }
         Progress::Begun => true,
         Progress::Open => {
-            cell.clear(folder)?;
+            RunFolder::clear(&cell.folder(folder))?;
             false
         }
     };
@@ -109,7 +109,7 @@ fn train(
 }
 
 /// A finished run with LPIPS, which it was trained without.
-fn measured_again(run: &Path, weights: &Path) -> Result<Evaluation, Error> {
+fn measured_again(run: &Path, weights: &Path, stop: &AtomicBool) -> Result<Evaluation, Error> {
     let mut explorer = Experiment::of_run(run)?.lpips(weights)?.restored_explorer()?;
-    measure(&mut explorer, &RunFolder::open(run)?)
+    measure(&mut explorer, &RunFolder::open(run)?, stop)
 }

@@ -51,6 +51,13 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
 
 fn tell(outcome: &Outcome) -> anyhow::Result<ExitCode> {
     let folder = outcome.folder.display();
+    if outcome.interrupted && outcome.trained {
+        print(&format!(
+            "stopped after the last step; `raygrad eval {folder}` measures the run, and the same command with \
+             `--out {folder} --resume` writes its report as well\n"
+        ))?;
+        return Ok(ExitCode::from(130));
+    }
     if outcome.interrupted {
         print(&format!("stopped; continue with the same command and `--out {folder} --resume`\n"))?;
         return Ok(ExitCode::from(130));

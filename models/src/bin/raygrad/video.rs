@@ -33,8 +33,13 @@ pub fn run(args: &VideoArgs) -> anyhow::Result<ExitCode> {
     let folder = args.out.as_ref().unwrap_or(&args.held.run);
     output_folder(folder)?;
     for (name, frames) in [("novel_view", &views.rgb), ("novel_view_depth", &views.depth)] {
-        let (Video::Mp4(path) | Video::AnimatedPng(path)) =
-            write_video(frames, RATE, &folder.join(name)).map_err(Error::from)?;
+        let path = match write_video(frames, RATE, &folder.join(name)).map_err(Error::from)? {
+            Video::Mp4(path) | Video::AnimatedPng(path, None) => path,
+            Video::AnimatedPng(path, Some(failure)) => {
+                eprintln!("note: an animated picture instead of a video: {failure}");
+                path
+            }
+        };
         print(&format!("{}\n", path.display()))?;
     }
     Ok(ExitCode::SUCCESS)
