@@ -36,6 +36,7 @@ pub fn recorded() -> Vec<(&'static str, Tensor)> {
         ("points of three dimensions in a plane", plane(&points, &colour, &sample)),
         ("a scale that is not positive", points.gaussian(-1.0)),
         ("scattered into an axis the values have", colour.scatter(&count, &ray, &Axes::none())),
+        ("bounds in the wrong order", colour.clamp(1.0, 0.0)),
     ]
 }
 

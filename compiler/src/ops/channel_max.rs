@@ -1,6 +1,6 @@
-//! Maximum over the channels; its gradient is shared equally between ties.
+//! Maximum over the channels, NaN if one is; its gradient is shared equally between ties.
 
-use super::{Form, Op, Sample, expect_dtype, pointwise::unary};
+use super::{Form, Op, Sample, expect_dtype, pointwise::unary, reduce::larger};
 use crate::cost::Work;
 use crate::graph::{Channels, Misfit, Shape, Tensor};
 use crate::reference::{Array, Lane};
@@ -24,7 +24,7 @@ impl Op for ChannelMax {
         let channels = inputs[0].shape.channels.count();
         Array::from_fn(out, |e, _| {
             let lanes = (0..channels).map(|c| inputs[0].at(e, c).f());
-            Lane::F(lanes.fold(f64::NEG_INFINITY, |a, b| if a > b { a } else { b }))
+            Lane::F(lanes.fold(f64::NEG_INFINITY, larger))
         })
     }
     fn vjp(&self, inputs: &[Tensor], output: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {

@@ -182,6 +182,7 @@ registry!(
     neg,
     min,
     max,
+    clamp,
     compare,
     select,
     cast,

@@ -1,4 +1,4 @@
-//! Sum and maximum over axes.
+//! Sum and maximum over axes. The maximum is NaN if a value is.
 
 use super::{Form, Op, Reduction, Sample, SampleInput, expect_dtype};
 use crate::cost::Work;
@@ -47,7 +47,7 @@ impl Op for Reduce {
                 let slot = &mut y.f_mut()[at * n + c];
                 *slot = match self.kind {
                     Reduction::Sum => *slot + v,
-                    Reduction::Max => slot.max(v),
+                    Reduction::Max => larger(*slot, v),
                 };
             }
         }
@@ -70,6 +70,11 @@ impl Op for Reduce {
     fn work(&self, _: &[Shape], out: &Shape) -> Work {
         Work::others(out.channels.count() as u64)
     }
+}
+
+/// The larger of two numbers, NaN if either is.
+pub(crate) fn larger(a: f64, b: f64) -> f64 {
+    if a > b || a.is_nan() { a } else { b }
 }
 
 impl Tensor {

@@ -51,7 +51,7 @@ impl Pointwise for Softplus {
             sum = b.emit(Prim::Add, &[scaled, b.f(2.0 / (2 * k + 1) as f32)]);
         }
         let log = b.emit(Prim::Mul, &[sum, s]);
-        let ramp = b.emit(Prim::Max, &[z, zero]);
+        let ramp = b.emit(Prim::Max, &[zero, z]);
         let total = b.emit(Prim::Add, &[ramp, log]);
         let curved = b.emit(Prim::Mul, &[total, b.f((1.0 / self.beta) as f32)]);
         let linear = b.emit(Prim::Lt, &[b.f(LINEAR as f32), z]);
