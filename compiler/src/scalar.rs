@@ -23,9 +23,9 @@ pub enum Prim {
     Sub,
     Mul,
     Div,
-    /// `if a < b { a } else { b }`
+    /// `if a < b { a } else { b }`: of NaN, a second operand passes and a first one does not.
     Min,
-    /// `if a > b { a } else { b }`
+    /// `if a > b { a } else { b }`, likewise.
     Max,
     /// `Atan2(y, x)`
     Atan2,

@@ -63,11 +63,19 @@ struct Readme;
 #[doc = include_str!("../../docs/new_warp.md")]
 struct NewWarp;
 
-/// What defining and training a warp takes.
+/// What defining and training a warp takes. Ops are methods of [`Tensor`](prelude::Tensor), functions of them are listed in
+/// [`raygrad_compiler::functions`].
 pub mod prelude {
     pub use crate::warps::{Points, Warp};
     pub use crate::{Device, Experiment};
-    pub use raygrad_compiler::functions::mlp::{Init, Mlp, MlpSpec, Parameter};
+    pub use raygrad_compiler::functions::along::{concat_along, slice_along};
+    pub use raygrad_compiler::functions::inverse::{determinant, inverse, solve};
+    pub use raygrad_compiler::functions::lie::{cross, se2_exp, se3_exp, sl3_exp, so2_exp, so3_exp};
+    pub use raygrad_compiler::functions::loss::{charbonnier, mean_absolute_error, mean_squared_error};
+    pub use raygrad_compiler::functions::matrix::{apply, apply_affine, apply_homography, matmul};
+    pub use raygrad_compiler::functions::mlp::{Activation, Init, Mlp, MlpSpec, Parameter};
+    pub use raygrad_compiler::functions::posenc::positional_encoding;
+    pub use raygrad_compiler::functions::vector::{dot, norm, normalize};
     pub use raygrad_compiler::ops::pick::concat;
     pub use raygrad_compiler::{Axis, Shape, Tensor};
 }

@@ -130,6 +130,23 @@ pub fn check_second_order(output: &Tensor, parameters: &[Tensor], bindings: &Bin
     check_gradient(&slope, parameters, &bindings, tolerance, what);
 }
 
+/// Checks first and second derivatives of `f` on uniform parameters, times a random factor.
+pub fn derivatives(name: &str, shapes: &[(Shape, f64, f64)], f: impl Fn(&[Tensor]) -> Tensor) {
+    let mut bindings = Bindings::new();
+    let mut rng = Rng(seed(name));
+    let mut parameters = vec![];
+    for (i, (shape, low, high)) in shapes.iter().enumerate() {
+        bindings.insert(format!("p{i}"), rng.array(shape, *low, *high));
+        parameters.push(Tensor::parameter(format!("p{i}"), shape.clone()));
+    }
+    let y = f(&parameters);
+    assert!(y.error().is_none(), "{name}: {:?}", y.error());
+    bindings.insert("upstream".into(), rng.array(y.shape(), -1.0, 1.0));
+    let loss = total(&(&y * Tensor::data("upstream", y.shape().clone())));
+    check_gradient(&loss, &parameters, &bindings, 1e-7, name);
+    check_second_order(&loss, &parameters, &bindings, 1e-6, name);
+}
+
 /// An array of the given axes and channels.
 pub fn floats(axes: &[&Axis], channels: usize, values: &[f64]) -> Array {
     Array::floats(&Shape::new(axes, channels), values.to_vec())

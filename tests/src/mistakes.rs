@@ -1,8 +1,12 @@
 //! Mistakes that people make, for the messages they get. The messages name lines of this file.
 
+use raygrad_compiler::functions::along::{concat_along, slice_along};
 use raygrad_compiler::functions::homography::{Solver, fit_homography};
+use raygrad_compiler::functions::inverse::{inverse, solve};
+use raygrad_compiler::functions::loss::charbonnier;
 use raygrad_compiler::functions::matrix::matmul;
 use raygrad_compiler::functions::mlp::{Mlp, MlpSpec};
+use raygrad_compiler::functions::vector::norm;
 use raygrad_compiler::graph::{Axes, Axis, Shape, Tensor};
 use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::ops::pick::concat;
@@ -17,6 +21,7 @@ pub fn recorded() -> Vec<(&'static str, Tensor)> {
     let code = Tensor::parameter("code", Shape::new(&[&frame], 32));
     let weights = Tensor::parameter("layer0.weight", Shape::new(&[], (35, 256)));
     let count = Tensor::data("count", Shape::new(&[&ray], 1).with_dtype(DType::U32));
+    let part = Axis::new("part", 32);
     let other = Tensor::data("other", Shape::new(&[&Axis::new("ray", 2048)], 3));
     vec![
         ("channels of a sum that differ", &points + &colour),
@@ -36,6 +41,18 @@ pub fn recorded() -> Vec<(&'static str, Tensor)> {
         ("points of three dimensions in a plane", plane(&points, &colour, &sample)),
         ("a scale that is not positive", points.gaussian(-1.0)),
         ("scattered into an axis the values have", colour.scatter(&count, &ray, &Axes::none())),
+        ("bounds in the wrong order", colour.clamp(1.0, 0.0)),
+        ("a power of an integer", count.powf(2.2)),
+        ("an angle of an integer", count.acos()),
+        ("the length of an integer", norm(&count)),
+        ("a matrix that has no inverse", inverse(&weights)),
+        ("a right side that does not fit", solve(&colour.reshape((2, 2)), &points)),
+        ("a slice past the end", slice_along(&colour, &ray, 1000, &part)),
+        ("a slice along an axis that is not there", slice_along(&colour, &sample, 0, &part)),
+        ("a slice into an axis that is there", slice_along(&points, &ray, 0, &sample)),
+        ("parts that do not fill an axis", concat_along(&[(&colour, &ray), (&points, &ray)], &part)),
+        ("parts with other channels", concat_along(&[(&colour, &ray), (&points, &ray)], &Axis::new("both", 2048))),
+        ("a Charbonnier loss without a width", charbonnier(&points, &other, 0.0)),
     ]
 }
 

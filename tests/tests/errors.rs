@@ -1,8 +1,15 @@
 //! Messages of ops that do not fit: both operands with axes and channels, the user's line, and a hint.
 
 use raygrad_compiler::autodiff::{grad, jvp};
-use raygrad_compiler::functions::matrix::matmul;
-use raygrad_compiler::graph::{Axes, Axis, Shape, Tensor};
+use raygrad_compiler::functions::along::{concat_along, slice_along};
+use raygrad_compiler::functions::inverse::{determinant, solve};
+use raygrad_compiler::functions::lie::{se3_exp, sl3_exp, so3_exp};
+use raygrad_compiler::functions::loss::charbonnier;
+use raygrad_compiler::functions::matrix::{apply_homography, matmul};
+use raygrad_compiler::functions::mlp::Activation;
+use raygrad_compiler::functions::posenc::positional_encoding;
+use raygrad_compiler::functions::vector::{norm, normalize};
+use raygrad_compiler::graph::{Axes, Axis, Shape, Tensor, topological};
 use raygrad_compiler::ops::custom::custom_adjoint;
 use raygrad_compiler::ops::map;
 use raygrad_compiler::reference::{Array, Bindings, EvalError, evaluate};
@@ -115,6 +122,37 @@ fn derived_functions_name_the_users_line() {
              operand 2: [] x (2, 3), from {from_a}\n  hint: the inner sizes must agree; transpose() one of them?"
         )
     );
+}
+
+/// What a run stops at, or a plan lists, is then a line of the user's.
+#[test]
+fn every_node_of_a_derived_function_carries_the_users_line() {
+    let (row, part, both) = (Axis::new("row", 3), Axis::new("part", 2), Axis::new("both", 6));
+    let x = Tensor::parameter("x", Shape::new(&[&row], 16));
+    let (v, m) = (x.slice(0..3), x.reshape((4, 4)));
+    let made = [
+        ("norm", norm(&v)),
+        ("normalize", normalize(&v)),
+        ("determinant", determinant(&m)),
+        ("solve", solve(&m, &x.slice(0..4))),
+        ("slice_along", slice_along(&x, &row, 1, &part)),
+        ("concat_along", concat_along(&[(&x, &row), (&x, &row)], &both)),
+        ("argmin_channels", x.argmin_channels().to_f32()),
+        ("powi", x.powi(-5)),
+        ("charbonnier", charbonnier(&x, &m.reshape(16), 0.1)),
+        ("elu", Activation::Elu.apply(&x)),
+        ("so3_exp", so3_exp(&v)),
+        ("se3_exp", se3_exp(&x.slice(0..6))),
+        ("sl3_exp", sl3_exp(&x.slice(0..8))),
+        ("positional_encoding", positional_encoding(&v, 3, None)),
+        ("apply_homography", apply_homography(&x.slice(0..9).reshape((3, 3)), &x.slice(0..2))),
+    ];
+    for (name, y) in made {
+        let gradient = grad(&y.sum_channels().sum_over(y.axes()), &[&x]).remove(0);
+        for node in topological([y, gradient]) {
+            assert_eq!(node.source().file(), file!(), "{name}: {node:?} of line {}", node.source().line());
+        }
+    }
 }
 
 #[test]

@@ -16,24 +16,7 @@ use raygrad_compiler::graph::{Axes, Axis, Shape, Tensor};
 use raygrad_compiler::reference::Array;
 use raygrad_tests::backend::{devices, reference, round, run};
 use raygrad_tests::vectors::Bound;
-use raygrad_tests::{Rng, check_gradient, check_second_order, seed, total, worst};
-
-/// Checks first and second derivatives of `f` on uniform parameters, times a random factor.
-fn derivatives(name: &str, shapes: &[(Shape, f64, f64)], f: impl Fn(&[Tensor]) -> Tensor) {
-    let mut bound = Bound::default();
-    let mut rng = Rng(seed(name));
-    let mut parameters = vec![];
-    for (i, (shape, low, high)) in shapes.iter().enumerate() {
-        bound.bindings.insert(format!("p{i}"), rng.array(shape, *low, *high));
-        parameters.push(Tensor::parameter(format!("p{i}"), shape.clone()));
-    }
-    let y = f(&parameters);
-    assert!(y.error().is_none(), "{name}: {:?}", y.error());
-    bound.bindings.insert("upstream".into(), rng.array(y.shape(), -1.0, 1.0));
-    let loss = total(&(&y * Tensor::data("upstream", y.shape().clone())));
-    check_gradient(&loss, &parameters, &bound.bindings, 1e-7, name);
-    check_second_order(&loss, &parameters, &bound.bindings, 1e-6, name);
-}
+use raygrad_tests::{Rng, check_gradient, check_second_order, derivatives, total, worst};
 
 fn shape(axes: &[&Axis], channels: usize) -> Shape {
     Shape::new(axes, channels)

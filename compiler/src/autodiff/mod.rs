@@ -104,9 +104,11 @@ pub fn zeros_like(t: &Tensor) -> Tensor {
 }
 
 fn constant_like(t: &Tensor, value: f64) -> Tensor {
-    let c = match t.channels() {
-        Channels::Vector(n) => Tensor::constant(&vec![value; n]),
-        Channels::Matrix(r, c) => Tensor::constant_matrix(r, c, &vec![value; r * c]),
-    };
-    c.broadcast_to(t.axes())
+    with_source(t.source(), || {
+        let c = match t.channels() {
+            Channels::Vector(n) => Tensor::constant(&vec![value; n]),
+            Channels::Matrix(r, c) => Tensor::constant_matrix(r, c, &vec![value; r * c]),
+        };
+        c.broadcast_to(t.axes())
+    })
 }

@@ -36,7 +36,7 @@ impl Activation {
             Activation::Elu => {
                 let zero = Tensor::scalar(0.0);
                 // The minimum keeps the exponential, and with it the gradient not taken, finite.
-                x.greater_than(&zero).select(x, &(x.min(&zero).exp() - 1.0))
+                x.greater_than(&zero).select(x, &x.min(&zero).expm1())
             }
             Activation::Sine(omega) => (x * omega).sin(),
         }

@@ -3,6 +3,9 @@
 //! | module | what |
 //! |---|---|
 //! | [`matrix`] | small matrices in channels: products, application to points, rigid poses, linear solve |
+//! | [`inverse`](mod@inverse) | determinants, inverses, and solutions of up to four unknowns |
+//! | [`vector`] | inner products, lengths, directions |
+//! | [`along`] | parts of an axis, and axes one after the other |
 //! | [`lie`] | exponentials of rotations, rigid motions and homographies |
 //! | [`posenc`] | positional encoding and its coarse-to-fine weights |
 //! | [`mlp`] | multi-layer perceptrons |
@@ -12,18 +15,21 @@
 //! | [`image`] | bilinear lookup |
 //! | [`composite`] | depth samples and volume rendering |
 //! | [`hierarchical`] | more depth samples where a first pass found weight |
-//! | [`loss`], [`adam`] | mean squared error, the Adam update |
+//! | [`loss`], [`adam`] | mean squared and absolute errors, Charbonnier; the Adam update |
 pub mod adam;
+pub mod along;
 pub mod composite;
 pub mod hierarchical;
 pub mod homography;
 pub mod image;
+pub mod inverse;
 pub mod lie;
 pub mod loss;
 pub mod matrix;
 pub mod mlp;
 pub mod posenc;
 pub mod rigid_fit;
+pub mod vector;
 pub mod weight_norm;
 
 use crate::graph::Tensor;

@@ -23,9 +23,13 @@ impl Pointwise for Atan2 {
     fn vjp(&self, x: &[Tensor], _: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
         let (y, x) = (&x[0], &x[1]);
         let (zero, one) = (Tensor::scalar(0.0), Tensor::scalar(1.0));
-        let square = x * x + y * y;
-        let origin = square.equal(&zero);
-        let scaled = origin.select(&zero, &(g / origin.select(&one, &square)));
+        // Squares of tiny and of huge numbers are out of range. The scale changes neither the value nor its derivatives.
+        let size = x.abs().max(&y.abs()).stop_gradient();
+        let origin = size.equal(&zero);
+        let size = origin.select(&one, &size);
+        let (x, y) = (x / &size, y / &size);
+        let square = origin.select(&one, &(&x * &x + &y * &y));
+        let scaled = origin.select(&zero, &(g / size / square));
         vec![Some(&scaled * x), Some(-(scaled * y))]
     }
     fn lower(&self, b: &mut ScalarBuilder, a: &[Val]) -> Val {

@@ -1,6 +1,6 @@
-//! Maximum over the channels; its gradient is shared equally between ties.
+//! Maximum over the channels, NaN if one is; its gradient is shared equally between ties.
 
-use super::{Form, Op, Sample, expect_dtype, pointwise::unary};
+use super::{Form, Op, Sample, expect_dtype, pointwise::unary, reduce::larger};
 use crate::cost::Work;
 use crate::graph::{Channels, Misfit, Shape, Tensor};
 use crate::reference::{Array, Lane};
@@ -24,7 +24,7 @@ impl Op for ChannelMax {
         let channels = inputs[0].shape.channels.count();
         Array::from_fn(out, |e, _| {
             let lanes = (0..channels).map(|c| inputs[0].at(e, c).f());
-            Lane::F(lanes.fold(f64::NEG_INFINITY, |a, b| if a > b { a } else { b }))
+            Lane::F(lanes.fold(f64::NEG_INFINITY, larger))
         })
     }
     fn vjp(&self, inputs: &[Tensor], output: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
@@ -44,8 +44,37 @@ impl Tensor {
     pub fn max_channels(&self) -> Tensor {
         Tensor::record(ChannelMax, &[self])
     }
+    /// Minimum over all channels.
+    #[track_caller]
+    pub fn min_channels(&self) -> Tensor {
+        -(-self).max_channels()
+    }
+    /// The channel of the largest value as `u32`, of equal ones the first. NaN is larger than nothing.
+    #[track_caller]
+    pub fn argmax_channels(&self) -> Tensor {
+        // Not the channel that equals the maximum: a value computed twice may differ in its rounding.
+        let mut most = self.ch(0);
+        let mut at = most.less_than(&most);
+        for c in 1..self.width() {
+            let next = self.ch(c);
+            let above = most.less_than(&next);
+            at = above.select(&Tensor::integers(&[c as u32]), &at);
+            most = above.select(&next, &most);
+        }
+        at
+    }
+    /// The channel of the smallest value, likewise.
+    #[track_caller]
+    pub fn argmin_channels(&self) -> Tensor {
+        (-self).argmax_channels()
+    }
 }
 
 pub fn samples() -> Vec<Sample> {
-    vec![unary("max_channels", -1.0, 1.0, Tensor::max_channels)]
+    vec![
+        unary("max_channels", -1.0, 1.0, Tensor::max_channels),
+        unary("min_channels", -1.0, 1.0, Tensor::min_channels),
+        unary("argmax_channels", -1.0, 1.0, |x| x.argmax_channels().to_f32()).not_differentiable(),
+        unary("argmin_channels", -1.0, 1.0, |x| x.argmin_channels().to_f32()).not_differentiable(),
+    ]
 }

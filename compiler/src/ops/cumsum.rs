@@ -1,4 +1,4 @@
-//! Exclusive cumulative sums, for transmittance along a ray.
+//! Cumulative sums; exclusive ones give the transmittance along a ray.
 
 use super::{Form, Op, Sample, SampleInput, expect_dtype};
 use crate::cost::Work;
@@ -65,6 +65,11 @@ impl Tensor {
     pub fn cumsum(&self, axis: &Axis) -> Tensor {
         Tensor::record(CumSum { axis: axis.clone(), reverse: false }, &[self])
     }
+    /// Inclusive cumulative sum along `axis`: the last element is the sum of all.
+    #[track_caller]
+    pub fn inclusive_cumsum(&self, axis: &Axis) -> Tensor {
+        self.cumsum(axis) + self
+    }
     /// Exclusive cumulative sum from the end: the last element is 0.
     #[track_caller]
     pub fn reverse_cumsum(&self, axis: &Axis) -> Tensor {
@@ -75,9 +80,10 @@ impl Tensor {
 pub fn samples() -> Vec<Sample> {
     let (ray, sample) = (Axis::new("ray", 3), Axis::new("sample", 6));
     let x = || vec![SampleInput::new(Shape::new(&[&ray, &sample], 2), -1.0, 1.0)];
-    let s = sample.clone();
+    let (s, s2) = (sample.clone(), sample.clone());
     vec![
         Sample::new("cumsum", x(), move |x| x[0].cumsum(&s)),
+        Sample::new("inclusive_cumsum", x(), move |x| x[0].inclusive_cumsum(&s2)),
         Sample::new("reverse_cumsum along the outer axis", x(), move |x| x[0].reverse_cumsum(&ray)),
     ]
 }

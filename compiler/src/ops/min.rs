@@ -1,4 +1,4 @@
-//! The smaller of two values, `if a < b { a } else { b }`; on ties the gradient goes to `a`.
+//! The smaller of two values, NaN if either is; on ties the gradient goes to `a`.
 
 use super::pointwise::{binary, unary};
 use super::{Pointwise, Sample, map};
@@ -18,19 +18,22 @@ impl Pointwise for Min {
     }
     fn eval(&self, a: &[Lane]) -> Lane {
         let (x, y) = (a[0].f(), a[1].f());
-        Lane::F(if x < y { x } else { y })
+        Lane::F(if x < y || x.is_nan() { x } else { y })
     }
     fn vjp(&self, x: &[Tensor], _: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
         let (first, zero) = (x[0].less_equal(&x[1]), Tensor::scalar(0.0));
         vec![Some(first.select(g, &zero)), Some(first.select(&zero, g))]
     }
     fn lower(&self, b: &mut ScalarBuilder, a: &[Val]) -> Val {
-        b.emit(Prim::Min, a)
+        // The primitive passes on a NaN of its second operand only.
+        let smaller = b.emit(Prim::Min, a);
+        let number = b.emit(Prim::Eq, &[a[0], a[0]]);
+        b.emit(Prim::Select, &[number, smaller, a[0]])
     }
 }
 
 impl Tensor {
-    /// The smaller of the two, lane by lane.
+    /// The smaller of the two, lane by lane; NaN where either is.
     #[track_caller]
     pub fn min(&self, other: &Tensor) -> Tensor {
         map(Min, &[self, other])

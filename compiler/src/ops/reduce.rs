@@ -1,4 +1,4 @@
-//! Sum and maximum over axes.
+//! Sum and maximum over axes. The maximum is NaN if a value is.
 
 use super::{Form, Op, Reduction, Sample, SampleInput, expect_dtype};
 use crate::cost::Work;
@@ -47,7 +47,7 @@ impl Op for Reduce {
                 let slot = &mut y.f_mut()[at * n + c];
                 *slot = match self.kind {
                     Reduction::Sum => *slot + v,
-                    Reduction::Max => slot.max(v),
+                    Reduction::Max => larger(*slot, v),
                 };
             }
         }
@@ -70,6 +70,11 @@ impl Op for Reduce {
     fn work(&self, _: &[Shape], out: &Shape) -> Work {
         Work::others(out.channels.count() as u64)
     }
+}
+
+/// The larger of two numbers, NaN if either is.
+pub(crate) fn larger(a: f64, b: f64) -> f64 {
+    if a > b || a.is_nan() { a } else { b }
 }
 
 impl Tensor {
@@ -103,6 +108,11 @@ impl Tensor {
         let over = Axes::new(over.iter().map(|a| (*a).clone()));
         Tensor::record(Reduce { kind: Reduction::Max, over }, &[self])
     }
+    /// Minimum over the given axes, likewise.
+    #[track_caller]
+    pub fn min_over(&self, over: &[&Axis]) -> Tensor {
+        -(-self).max_over(over)
+    }
     /// The same values with all of `axes`: repeated along those this tensor lacks.
     #[track_caller]
     pub fn broadcast_to(&self, axes: &Axes) -> Tensor {
@@ -135,13 +145,15 @@ impl Op for Broadcast {
 pub fn samples() -> Vec<Sample> {
     let (frame, row) = (Axis::new("frame", 3), Axis::new("row", 4));
     let x = || vec![SampleInput::new(Shape::new(&[&frame, &row], 2), -1.0, 1.0)];
-    let (f, f2, r, r2, r3) = (frame.clone(), frame.clone(), row.clone(), row.clone(), row.clone());
+    let (f, f2, f3) = (frame.clone(), frame.clone(), frame.clone());
+    let (r, r2, r3) = (row.clone(), row.clone(), row.clone());
     vec![
         Sample::new("sum over the inner axis", x(), move |x| x[0].sum(&[&r])),
         Sample::new("sum over the outer axis", x(), move |x| x[0].sum(&[&f])),
         Sample::new("sum over all axes", x(), move |x| x[0].sum(&[&f2, &r2])),
         Sample::new("mean_all", x(), |x| x[0].mean_all()),
         Sample::new("max_over", x(), move |x| x[0].max_over(&[&r3])),
+        Sample::new("min_over", x(), move |x| x[0].min_over(&[&f3])),
         Sample::new("broadcast", vec![SampleInput::new(Shape::new(&[&frame], 2), -1.0, 1.0)], move |x| {
             x[0].broadcast_to(&Axes::new([frame.clone(), row.clone()]))
         }),

@@ -1,4 +1,4 @@
-//! Rectifier, `max(x, 0)`; its derivative at 0 is 0.
+//! Rectifier, `max(x, 0)`; its derivative at 0 is 0. NaN stays NaN.
 
 use super::pointwise::unary;
 use super::{Pointwise, Sample, map};
@@ -18,15 +18,16 @@ impl Pointwise for Relu {
     }
     fn eval(&self, a: &[Lane]) -> Lane {
         let x = a[0].f();
-        Lane::F(if x > 0.0 { x } else { 0.0 })
+        Lane::F(if 0.0 > x { 0.0 } else { x })
     }
     fn vjp(&self, _: &[Tensor], y: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
         let zero = Tensor::scalar(0.0);
         vec![Some(y.greater_than(&zero).select(g, &zero))]
     }
     fn lower(&self, b: &mut ScalarBuilder, a: &[Val]) -> Val {
+        // In this order the primitive passes NaN on.
         let zero = b.f(0.0);
-        b.emit(Prim::Max, &[a[0], zero])
+        b.emit(Prim::Max, &[zero, a[0]])
     }
 }
 

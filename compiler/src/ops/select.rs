@@ -1,7 +1,8 @@
 //! Choice lane by lane, `if c != 0 { a } else { b }`.
 //!
 //! The gradient is a choice too, not a product with a mask: the branch not taken gets exact zeros. What it makes of them is its
-//! own: `x log x` at 0 multiplies its zero with an infinity. Choose its operands, too, where it is not defined.
+//! own: `x log x` at 0 multiplies its zero with an infinity, and the sum of both branches' gradients is NaN. Choose its operands,
+//! too, where it is not finite. A NaN that is not chosen ends here.
 
 use super::{Pointwise, Sample, SampleInput, map};
 use crate::graph::{Axis, Shape, Tensor};

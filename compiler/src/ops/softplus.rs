@@ -1,11 +1,11 @@
 //! Softplus, `log(1 + e^(beta x)) / beta`, and `x` where `beta x > 20`.
 //!
 //! Evaluated as `max(x, 0) + log(1 + e) / beta` with `e = e^-|beta x|`, which neither overflows nor cancels. Kernels take
-//! `log(1 + e) = 2 artanh(s)`, `s = e / (2 + e) <= 1/3`, from its series: `log` would lose every digit of a small `e`.
+//! the logarithm from the series of [`log1p`]: `log` would lose every digit of a small `e`.
 //! The derivative is `sigmoid(beta x)`, and 1 in the linear part.
 
 use super::pointwise::unary;
-use super::{Pointwise, Sample, map};
+use super::{Pointwise, Sample, log1p, map};
 use crate::graph::Tensor;
 use crate::reference::Lane;
 use crate::scalar::{DType, Prim, ScalarBuilder, Val};
@@ -36,22 +36,13 @@ impl Pointwise for Softplus {
         vec![Some(z.greater_than(&Tensor::scalar(LINEAR)).select(g, &curved))]
     }
     fn lower(&self, b: &mut ScalarBuilder, a: &[Val]) -> Val {
-        let (zero, two) = (b.f(0.0), b.f(2.0));
+        let zero = b.f(0.0);
         let z = b.emit(Prim::Mul, &[a[0], b.f(self.beta as f32)]);
         let size = b.emit(Prim::Abs, &[z]);
         let minus = b.emit(Prim::Neg, &[size]);
         let e = b.emit(Prim::Exp, &[minus]);
-        let below = b.emit(Prim::Add, &[two, e]);
-        let s = b.emit(Prim::Div, &[e, below]);
-        let s2 = b.emit(Prim::Mul, &[s, s]);
-        // 2 artanh(s) = s (2 + 2/3 s^2 + 2/5 s^4 + ...); the first term left out is below 2e-8 of the sum.
-        let mut sum = b.f(2.0 / 15.0);
-        for k in (0..7).rev() {
-            let scaled = b.emit(Prim::Mul, &[sum, s2]);
-            sum = b.emit(Prim::Add, &[scaled, b.f(2.0 / (2 * k + 1) as f32)]);
-        }
-        let log = b.emit(Prim::Mul, &[sum, s]);
-        let ramp = b.emit(Prim::Max, &[z, zero]);
+        let log = log1p::series(b, e);
+        let ramp = b.emit(Prim::Max, &[zero, z]);
         let total = b.emit(Prim::Add, &[ramp, log]);
         let curved = b.emit(Prim::Mul, &[total, b.f((1.0 / self.beta) as f32)]);
         let linear = b.emit(Prim::Lt, &[b.f(LINEAR as f32), z]);

@@ -233,7 +233,7 @@ impl Gemm {
                 Epilogue::Relu => {
                     for i in 0..MR {
                         for j in 0..NV {
-                            acc[i][j] = S::max(acc[i][j], zero);
+                            acc[i][j] = S::max(zero, acc[i][j]);
                         }
                     }
                 }

@@ -38,7 +38,7 @@ pub use outer::{Outer, outer, outer_len, outer_scratch, unblock};
 pub use panels::{pack_panels, panel_len};
 pub use peak::peak_gflops;
 pub use products::Products;
-pub use reduce::{rows_max, rows_sum};
+pub use reduce::{larger, raise, rows_max, rows_sum};
 pub use vector::{Operand, Operands, apply};
 
 /// Row counts of matrix kernels are multiples of this.

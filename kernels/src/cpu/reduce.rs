@@ -14,13 +14,27 @@ pub unsafe fn rows_sum(isa: Isa, x: *const f32, ldx: usize, channels: usize, row
     unsafe { launch(isa, &Reduce::<Sum> { x, ldx, channels, rows, acc, op: Sum }) }
 }
 
-/// Raises `acc[c]` to the maximum of the first `rows` values of channel `c`, which hold no NaN.
+/// Raises `acc[c]` to the maximum of the first `rows` values of channel `c`; NaN if one is.
 ///
 /// # Safety
 /// As [`rows_sum`].
 pub unsafe fn rows_max(isa: Isa, x: *const f32, ldx: usize, channels: usize, rows: usize, acc: *mut f32) {
     // SAFETY: forwarded contract.
     unsafe { launch(isa, &Reduce::<Max> { x, ldx, channels, rows, acc, op: Max }) }
+}
+
+/// Raises the first `len` values of `acc` to those of `x`; NaN where either is.
+///
+/// # Safety
+/// `isa.supported()`; `acc` and `x` are valid for `len` values.
+pub unsafe fn raise(isa: Isa, acc: *mut f32, x: *const f32, len: usize) {
+    // SAFETY: forwarded contract.
+    unsafe { launch(isa, &Raise { acc, x, len }) }
+}
+
+/// The larger of two numbers, NaN if either is.
+pub fn larger(a: f32, b: f32) -> f32 {
+    if a > b || a.is_nan() { a } else { b }
 }
 
 /// An associative operation.
@@ -56,12 +70,12 @@ impl Combine for Max {
     const START: f32 = f32::NEG_INFINITY;
     #[inline(always)]
     unsafe fn vectors<S: Simd>(a: S::V, b: S::V) -> S::V {
-        // SAFETY: forwarded contract.
-        unsafe { S::max(a, b) }
+        // SAFETY: forwarded contract. Of NaN, the maximum passes on that of `b`.
+        unsafe { S::select(S::eq(a, a), S::max(a, b), a) }
     }
     #[inline(always)]
     fn scalars(a: f32, b: f32) -> f32 {
-        if a > b { a } else { b }
+        larger(a, b)
     }
 }
 
@@ -131,6 +145,34 @@ impl<C: Combine> Reduce<C> {
                 half /= 2;
             }
             p[0]
+        }
+    }
+}
+
+struct Raise {
+    acc: *mut f32,
+    x: *const f32,
+    len: usize,
+}
+
+impl Kernel for Raise {
+    type Out = ();
+
+    #[inline(always)]
+    unsafe fn run<S: Simd>(&self) {
+        let whole = self.len / S::LANES * S::LANES;
+        let rest = self.len - whole;
+        // SAFETY: lanes below `len`.
+        unsafe {
+            for at in (0..whole).step_by(S::LANES) {
+                let acc = self.acc.add(at);
+                S::store(acc, Max::vectors::<S>(S::load(acc), S::load(self.x.add(at))));
+            }
+            if rest > 0 {
+                let acc = self.acc.add(whole);
+                let raised = Max::vectors::<S>(S::load_head(acc, rest), S::load_head(self.x.add(whole), rest));
+                S::store_head(acc, rest, raised);
+            }
         }
     }
 }

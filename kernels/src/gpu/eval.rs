@@ -7,6 +7,7 @@
 use super::builder::{Memory, Value};
 use super::channels::{Linear, Run, affine, is_indexable, runs_of, sequence};
 use super::memory::{Emit, Position, is_run, kind};
+use super::scalar::larger;
 use super::{eigen, scalar};
 use naga::BinaryOperator as Op;
 use raygrad_compiler::graph::{Axes, Axis};
@@ -278,21 +279,17 @@ impl<'r> Values<'r> {
     fn channel_max(&mut self, e: &mut Emit, of: InstId) -> Value {
         let channels = self.region.inst(of).channels;
         let first = self.channel(e, of, Channel::At(0));
-        let larger = |e: &mut Emit, a: Value, b: Value| {
-            let above = e.b.binary(Op::Greater, b, a);
-            e.b.select(above, b, a)
-        };
         if channels > UNROLL && is_indexable(self.region, of) {
             let first = if self.at.len() == 4 { e.b.splat(first) } else { first };
             return self.fold(e, channels, first, |values, e, most, i| {
                 let next = values.channel(e, of, Channel::Var(i));
-                larger(e, most, next)
+                larger(&mut e.b, most, next)
             });
         }
         (1..channels as u32).fold(first, |most, c| {
             let next = self.channel(e, of, Channel::At(c));
             e.b.topic("largest");
-            larger(e, most, next)
+            larger(&mut e.b, most, next)
         })
     }
 

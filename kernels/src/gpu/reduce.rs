@@ -9,6 +9,7 @@ use super::chunks::{End, finish};
 use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
 use super::memory::{Emit, Position, WORKGROUP, is_run};
+use super::scalar::larger;
 use super::{Kernel, LowerError};
 use raygrad_compiler::graph::{Axes, Shape};
 use raygrad_compiler::ops::Reduction;
@@ -32,10 +33,7 @@ pub(super) const MAX_CHUNKS: usize = 256;
 pub(super) fn combine(b: &mut Builder, kind: Reduction, so_far: Value, next: Value) -> Value {
     match kind {
         Reduction::Sum => b.add(so_far, next),
-        Reduction::Max => {
-            let above = b.less(so_far, next);
-            b.select(above, next, so_far)
-        }
+        Reduction::Max => larger(b, so_far, next),
     }
 }
 

@@ -165,6 +165,14 @@ fn sine(b: &mut Builder, x: Value, shift: f32) -> Value {
     b.select(odd, minus, result)
 }
 
+/// The larger of two values; NaN if either is.
+pub(super) fn larger(b: &mut Builder, x: Value, y: Value) -> Value {
+    let above = b.binary(Op::GreaterEqual, x, y);
+    let larger = b.select(above, x, y);
+    let number = b.binary(Op::Equal, x, x);
+    b.select(number, larger, x)
+}
+
 /// The lower of a number and a value; NaN if the value is, where `Math::Min` may give the number.
 fn lower(b: &mut Builder, number: Value, x: Value) -> Value {
     let past = b.less(number, x);

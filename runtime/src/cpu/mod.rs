@@ -11,7 +11,7 @@ use raygrad_compiler::ops::Reduction;
 use raygrad_compiler::plan::BufferKind;
 use raygrad_compiler::plan::region::BufferId;
 use raygrad_kernels::cpu::tile::{Chunk, Flat, Memory, TileProgram, lower, pack, run_tiles, split_flat};
-use raygrad_kernels::cpu::{AlignedVec, Isa, Products, unblock};
+use raygrad_kernels::cpu::{AlignedVec, Isa, Products, larger, unblock};
 use rayon::prelude::*;
 use std::cell::RefCell;
 use std::collections::HashMap;
@@ -278,7 +278,7 @@ fn combine(tiles: &TileProgram, all: &mut [f32], memory: Memory, lanes: &[usize]
                 let (to, from) = unsafe { (columns.lanes(c, a.at, &range), columns.lanes(c + step, a.at, &range)) };
                 match a.kind {
                     Reduction::Sum => to.iter_mut().zip(from).for_each(|(t, f)| *t += *f),
-                    Reduction::Max => to.iter_mut().zip(from).for_each(|(t, f)| *t = if *f > *t { *f } else { *t }),
+                    Reduction::Max => to.iter_mut().zip(from).for_each(|(t, f)| *t = larger(*t, *f)),
                 }
             }
             step *= 2;

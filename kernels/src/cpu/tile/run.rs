@@ -4,7 +4,7 @@ mod scans;
 mod transfer;
 
 use super::*;
-use crate::cpu::{Epilogue, Gemm, Isa, Operand, ROW_BLOCK, apply, gemm, pack_panels};
+use crate::cpu::{Epilogue, Gemm, Isa, Operand, ROW_BLOCK, apply, gemm, pack_panels, raise};
 use raygrad_compiler::ops::sym_eig::jacobi;
 
 /// Base addresses of a program's buffers, by [`BufferId`].
@@ -160,7 +160,7 @@ impl Tile<'_> {
                     let out = self.at(*out);
                     std::ptr::copy(self.at(from[0]), out, len);
                     for place in &from[1..] {
-                        self.apply(Prim::Max, out, out, self.at(*place), len);
+                        raise(self.isa, out, self.at(*place), len);
                     }
                 }
                 TileOp::Gather { from, from_full, to, full } => {
@@ -210,9 +210,10 @@ impl Tile<'_> {
         }
     }
 
-    unsafe fn apply(&self, prim: Prim, out: *mut f32, a: *const f32, b: *const f32, len: usize) {
+    unsafe fn add(&self, out: *mut f32, a: *const f32, b: *const f32, len: usize) {
+        let operands = [Operand::Lanes(a), Operand::Lanes(b), Operand::Splat(0)].into();
         // SAFETY: forwarded; the callers pass scratch places of `len` lanes.
-        unsafe { apply(self.isa, prim, out, &[Operand::Lanes(a), Operand::Lanes(b), Operand::Splat(0)].into(), len) }
+        unsafe { apply(self.isa, Prim::Add, out, &operands, len) }
     }
 
     unsafe fn operand(&self, value: &Value, channel: usize, full: bool) -> Operand {
@@ -251,7 +252,7 @@ impl Tile<'_> {
                     Some((first, rest)) => {
                         std::ptr::copy_nonoverlapping(self.at(from[*first as usize]), out, len);
                         for c in rest {
-                            self.apply(Prim::Add, out, out, self.at(from[*c as usize]), len);
+                            self.add(out, out, self.at(from[*c as usize]), len);
                         }
                     }
                 }
@@ -318,7 +319,7 @@ impl Tile<'_> {
                     let to = if k == 0 { out } else { product };
                     apply(self.isa, Prim::Mul, to, &[a, b, Operand::Splat(0)].into(), len);
                     if k > 0 {
-                        self.apply(Prim::Add, out, out, product, len);
+                        self.add(out, out, product, len);
                     }
                 }
             }

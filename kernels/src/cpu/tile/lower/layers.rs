@@ -47,7 +47,7 @@ impl Lowering<'_> {
         let (adds, epilogue) = match program.code.split_last()? {
             ((Prim::Max, args), adds) => {
                 let rectified = adds.len().checked_sub(1).map_or(y, |last| Val::Inst(last as u16));
-                (*args == [rectified, zero]).then_some((adds, LayerEpilogue::Relu))?
+                (*args == [zero, rectified]).then_some((adds, LayerEpilogue::Relu))?
             }
             _ => (&program.code[..], LayerEpilogue::None),
         };

@@ -1,7 +1,7 @@
 //! Between a tile and memory: loads, lookups, and stores with what they combine.
 
 use super::*;
-use crate::cpu::{outer, rows_max, rows_sum};
+use crate::cpu::{larger, outer, rows_max, rows_sum};
 use std::ops::Range;
 
 impl Tile<'_> {
@@ -153,7 +153,7 @@ impl Tile<'_> {
             unsafe {
                 match kind {
                     Reduction::Sum => *to += x,
-                    Reduction::Max => *to = if x > *to { x } else { *to },
+                    Reduction::Max => *to = larger(*to, x),
                 }
             }
         };
