@@ -136,7 +136,6 @@ impl Builder {
         let mut needed = vec![];
         // What the region reads in any case, and what it reads only to compute something again, with the channels.
         let (mut read, mut readable) = (HashSet::new(), BTreeMap::new());
-        let mut room = self.cuts.target.store_bytes;
         let mut seen: HashSet<u64> = ids.clone().into_iter().collect();
         let mut stack: Vec<u64> = ids.iter().copied().collect();
         while let Some(id) = stack.pop() {
@@ -172,22 +171,23 @@ impl Builder {
                 }
             }
             if earlier {
-                candidates.push(self.candidate(id, operands, &mut room));
+                candidates.push(self.candidate(id, operands));
             }
         }
         for (id, channels) in &readable {
             let bytes = 4 * (self.cuts.nodes[id].tensor.axes().elements() * channels.len()) as u64;
             let stored = if read.contains(id) { 0 } else { cost(self.cuts.target.seconds_of_bytes(bytes)) };
-            candidates.push(Candidate { id: *id, stored, again: NEVER, operands: vec![] });
+            candidates.push(Candidate { id: *id, stored, again: NEVER, bytes: 0, operands: vec![] });
         }
-        for id in choose(&candidates, &needed).into_iter().filter(|id| !readable.contains_key(id)) {
+        let chosen = choose(candidates, &needed, self.cuts.target.store_bytes);
+        for id in chosen.into_iter().filter(|id| !readable.contains_key(id)) {
             let tensor = self.cuts.nodes[&id].tensor.clone();
             self.store(&tensor);
         }
     }
 
-    /// What storing a node takes, and what computing it again from its operands. `room` is what wide values may still take.
-    fn candidate(&self, id: u64, operands: Vec<u64>, room: &mut usize) -> Candidate {
+    /// What storing a node takes, and what computing it again from its operands.
+    fn candidate(&self, id: u64, operands: Vec<u64>) -> Candidate {
         let (info, target) = (&self.cuts.nodes[&id], &self.cuts.target);
         let bytes = 4 * info.tensor.shape().lanes();
         // Where nothing is stored yet there will be one more launch.
@@ -196,11 +196,8 @@ impl Builder {
         // Wide values are stored as long as there is room; over few elements they take none worth mentioning.
         let narrow = info.tensor.width() <= target.store_channels || bytes <= target.store_free_bytes;
         // A copy has no buffer of its own: what follows a stored reduction is computed again.
-        let storable = info.copy_of.is_none() && (narrow || bytes <= *room);
-        if storable && !narrow && stored < again {
-            *room -= bytes;
-        }
-        Candidate { id, stored: if storable { stored } else { NEVER }, again, operands }
+        let stored = if info.copy_of.is_none() { stored } else { NEVER };
+        Candidate { id, stored, again, bytes: if narrow { 0 } else { bytes }, operands }
     }
 
     /// The region of `key` that stores `ids`, and the nodes it computes.

@@ -3,10 +3,11 @@
 //! A region needs some values that regions before it compute over the same domain. Each value on the way to them is either
 //! stored, which takes the time to write and to read it, or computed again from what it is computed from, which takes the time
 //! of that. The cheapest choice is a minimum cut of a network in which a value is two nodes: cutting the edge between them stores
-//! it, cutting an edge from the source to the first computes it again. (The partitioning of forward and backward passes in
+//! it, cutting an edge from the source to the first computes it again. Where wide values of a cut do not fit into memory together,
+//! those that are dearest to compute again keep their place, and a cut without the others is sought. (The partitioning of forward and backward passes in
 //! PyTorch's AOTAutograd is a cut, too, but of what may not be computed again from what is needed.)
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 
 /// A value that could be stored.
 pub(super) struct Candidate {
@@ -15,6 +16,8 @@ pub(super) struct Candidate {
     pub stored: u64,
     /// What computing it again costs, given its operands; [`NEVER`] where it lies in memory in any case.
     pub again: u64,
+    /// What it takes of the room that stored values share; 0 of those that may be stored in any case.
+    pub bytes: usize,
     /// The candidates it is computed from.
     pub operands: Vec<u64>,
 }
@@ -22,9 +25,43 @@ pub(super) struct Candidate {
 /// More than anything costs.
 pub(super) const NEVER: u64 = u64::MAX;
 
-/// The cheapest set of candidates to read from memory, so that `needed` can be computed.
-pub(super) fn choose(candidates: &[Candidate], needed: &[u64]) -> Vec<u64> {
+/// The cheapest set of candidates to read from memory, so that `needed` can be computed, of which all that share `room` fit into it.
+pub(super) fn choose(mut candidates: Vec<Candidate>, needed: &[u64], mut room: usize) -> Vec<u64> {
     let index: HashMap<u64, usize> = candidates.iter().enumerate().map(|(i, c)| (c.id, i)).collect();
+    loop {
+        let chosen = cheapest(&candidates, &index, needed);
+        // What takes longest to compute again for its bytes comes first, and keeps its place.
+        let worth = |i: &usize| again_from(&candidates, &index, &chosen, *i) as f64 / candidates[*i].bytes as f64;
+        let waiting = chosen.iter().filter(|i| candidates[**i].bytes > 0);
+        let mut waiting: Vec<(f64, usize)> = waiting.map(|i| (worth(i), *i)).collect();
+        waiting.sort_by(|a, b| b.0.total_cmp(&a.0));
+        let mut fit = true;
+        for (_, i) in waiting {
+            match room.checked_sub(candidates[i].bytes) {
+                Some(rest) => (room, candidates[i].bytes) = (rest, 0),
+                None => (candidates[i].stored, fit) = (NEVER, false),
+            }
+        }
+        if fit {
+            return chosen.into_iter().map(|i| candidates[i].id).collect();
+        }
+    }
+}
+
+/// What computing the candidate at `which` again costs, from the other chosen ones on.
+fn again_from(candidates: &[Candidate], index: &HashMap<u64, usize>, chosen: &[usize], which: usize) -> u64 {
+    let mut seen: HashSet<usize> = chosen.iter().copied().collect();
+    let (mut stack, mut cost) = (vec![which], 0u64);
+    while let Some(i) = stack.pop() {
+        let Candidate { stored, again, .. } = candidates[i];
+        cost = cost.saturating_add(if again == NEVER { stored } else { again });
+        stack.extend(candidates[i].operands.iter().map(|o| index[o]).filter(|o| seen.insert(*o)));
+    }
+    cost
+}
+
+/// The cheapest cut, by the candidates' places.
+fn cheapest(candidates: &[Candidate], index: &HashMap<u64, usize>, needed: &[u64]) -> Vec<usize> {
     let (source, sink) = (2 * candidates.len(), 2 * candidates.len() + 1);
     let mut flow = Flow::new(2 * candidates.len() + 2);
     for (i, c) in candidates.iter().enumerate() {
@@ -41,7 +78,7 @@ pub(super) fn choose(candidates: &[Candidate], needed: &[u64]) -> Vec<u64> {
     // Of all minimum cuts the one nearest to the needs: what is stored is then used as it is.
     let ahead = flow.reaches(sink);
     let cut = |i: &usize| !ahead[2 * i] && ahead[2 * i + 1];
-    (0..candidates.len()).filter(cut).map(|i| candidates[i].id).collect()
+    (0..candidates.len()).filter(cut).collect()
 }
 
 /// Maximum flow by shortest augmenting paths (Edmonds and Karp).
@@ -117,7 +154,7 @@ mod tests {
     use super::{Candidate, NEVER, choose};
 
     fn candidate(id: u64, stored: u64, again: u64, operands: &[u64]) -> Candidate {
-        Candidate { id, stored, again, operands: operands.to_vec() }
+        Candidate { id, stored, again, bytes: 0, operands: operands.to_vec() }
     }
 
     /// layer(3) -> series of many 2-channel values, all needed: the layer's 3 channels are stored.
@@ -125,20 +162,20 @@ mod tests {
     fn a_narrow_source_is_stored_once() {
         let all: Vec<Candidate> =
             std::iter::once(candidate(0, 3, 50, &[])).chain((1..9).map(|i| candidate(i, 2, 1, &[0]))).collect();
-        assert_eq!(choose(&all, &[1, 2, 3, 4, 5, 6, 7, 8]), vec![0]);
+        assert_eq!(choose(all, &[1, 2, 3, 4, 5, 6, 7, 8], 0), vec![0]);
     }
 
     /// layer(34) -> sum(2), needed: the sum is stored.
     #[test]
     fn a_narrow_result_is_stored_instead_of_its_wide_source() {
-        let all = [candidate(0, 34, 500, &[]), candidate(1, 34, 1, &[0]), candidate(2, 2, 1, &[1])];
-        assert_eq!(choose(&all, &[2]), vec![2]);
+        let all = vec![candidate(0, 34, 500, &[]), candidate(1, 34, 1, &[0]), candidate(2, 2, 1, &[1])];
+        assert_eq!(choose(all, &[2], 0), vec![2]);
     }
 
     #[test]
     fn what_is_cheap_from_inputs_is_not_stored() {
-        let all = [candidate(0, 2, 1, &[]), candidate(1, 2, 0, &[0])];
-        assert!(choose(&all, &[1]).is_empty());
+        let all = vec![candidate(0, 2, 1, &[]), candidate(1, 2, 0, &[0])];
+        assert!(choose(all, &[1], 0).is_empty());
     }
 
     /// Each step of a chain is cheaper than storing it, all together are not.
@@ -147,22 +184,50 @@ mod tests {
         let chain = |length: u64| -> Vec<Candidate> {
             (0..length).map(|i| candidate(i, 8, 3, &i.checked_sub(1).into_iter().collect::<Vec<_>>())).collect()
         };
-        assert!(choose(&chain(2), &[1]).is_empty());
-        assert_eq!(choose(&chain(3), &[2]), vec![2]);
+        assert!(choose(chain(2), &[1], 0).is_empty());
+        assert_eq!(choose(chain(3), &[2], 0), vec![2]);
     }
 
     /// A value of one channel from many that lie in memory: reading those takes longer than reading it.
     #[test]
     fn what_must_be_read_to_compute_a_value_counts() {
-        let all = |wide: u64| [candidate(0, wide, NEVER, &[]), candidate(1, 2, 1, &[0])];
-        assert_eq!(choose(&all(64), &[1]), vec![1]);
-        assert_eq!(choose(&all(0), &[1]), vec![0]);
+        let all = |wide: u64| vec![candidate(0, wide, NEVER, &[]), candidate(1, 2, 1, &[0])];
+        assert_eq!(choose(all(64), &[1], 0), vec![1]);
+        assert_eq!(choose(all(0), &[1], 0), vec![0]);
     }
 
     /// What must not be stored is computed again, whatever it costs.
     #[test]
     fn without_room_all_is_computed_again() {
-        let all = [candidate(0, NEVER, 500, &[]), candidate(1, NEVER, 1, &[0])];
-        assert!(choose(&all, &[1]).is_empty());
+        let all = vec![candidate(0, NEVER, 500, &[]), candidate(1, NEVER, 1, &[0])];
+        assert!(choose(all, &[1], 0).is_empty());
+    }
+
+    fn wide(id: u64, stored: u64, again: u64, operands: &[u64]) -> Candidate {
+        Candidate { bytes: 100, ..candidate(id, stored, again, operands) }
+    }
+
+    /// Ends of two chains, each dear enough to be stored only together with what is before it.
+    #[test]
+    fn what_fits_alone_must_fit_together() {
+        let all = || vec![wide(0, 9, 6, &[]), wide(1, 9, 6, &[0]), wide(2, 9, 7, &[]), wide(3, 9, 7, &[2])];
+        assert_eq!(choose(all(), &[1, 3], 200), vec![1, 3]);
+        assert_eq!(choose(all(), &[1, 3], 199), vec![3]);
+        assert!(choose(all(), &[1, 3], 99).is_empty());
+    }
+
+    /// A value that nobody stores takes no room: not of the layers, but of what follows them.
+    #[test]
+    fn only_what_is_stored_takes_room() {
+        let all = vec![wide(0, 9, 50, &[]), candidate(1, 2, 1, &[0]), wide(2, 9, 40, &[])];
+        assert_eq!(choose(all, &[1, 2], 100), vec![1, 2]);
+    }
+
+    /// Where the last of a chain has no place, what it is computed from does not take it either.
+    #[test]
+    fn the_dearest_keeps_its_place() {
+        let layer = |id: u64, again: u64| [wide(id, 9, again, &[]), wide(id + 1, 9, 1, &[id])];
+        let all = [layer(0, 50), layer(2, 70), layer(4, 60)].into_iter().flatten().collect();
+        assert_eq!(choose(all, &[1, 3, 5], 100), vec![3]);
     }
 }

@@ -8,11 +8,13 @@ pub mod region;
 mod spec;
 
 use crate::fuse::{Fused, Origin, Target, TargetKind, fuse};
-use crate::graph::{Axes, Shape};
-use crate::ops::input::Role;
+use crate::graph::{Axes, Shape, Tensor};
+use crate::ops::input::{Input, Role};
 use crate::simplify::simplify;
 use crate::step::{Step, StepError};
 use region::{BufferId, Inst, InstId, Region, RegionOp, Store};
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::ops::Range;
 use std::time::{Duration, Instant};
 
 /// What a buffer is for.
@@ -105,30 +107,30 @@ fn count_ops(step: &Step) -> usize {
 
 fn plan(step: &Step, fused: Fused, target: Target) -> Program {
     let mut buffers: Vec<Buffer> = fused.buffers.iter().map(|(origin, shape)| describe(origin, shape)).collect();
-    let mut launches: Vec<Launch> = fused
-        .regions
-        .into_iter()
-        .zip(fused.recomputed)
-        .map(|(region, recomputed)| Launch { name: String::new(), region, recomputed })
-        .collect();
+    let targets = input_buffers(&mut buffers, step);
+    let updated: HashSet<BufferId> = targets.iter().copied().collect();
+    let mut roots: HashMap<BufferId, usize> = HashMap::new();
+    fused.roots.iter().for_each(|root| *roots.entry(*root).or_default() += 1);
     let (outputs, updates) = fused.roots.split_at(step.outputs.len());
-    let targets: Vec<BufferId> = step.updates.iter().map(|(input, _)| input_buffer(&mut buffers, input)).collect();
-    for (((_, value), source), target_buffer) in step.updates.iter().zip(updates).zip(targets.iter().copied()) {
+    let accesses = Accesses::of(&fused.regions);
+    let mut renamed: HashMap<BufferId, BufferId> = HashMap::new();
+    // Copies that come before all other launches, the last one first, and those that come after them.
+    let (mut before, mut after) = (vec![], vec![]);
+    for (((_, value), source), target) in step.updates.iter().zip(updates).zip(targets) {
         // The old value of an input that is itself updated is set aside first.
-        let mut source = source;
-        let aside;
-        if targets.contains(source) && *source != target_buffer {
+        let mut source = *source;
+        if updated.contains(&source) && source != target {
             let Buffer { shape, label, .. } = buffers[source.0 as usize].clone();
             buffers.push(Buffer { kind: BufferKind::Temporary { slot: 0 }, shape, label });
-            aside = BufferId(buffers.len() as u32 - 1);
-            launches.insert(0, copy(&buffers, *source, aside));
-            source = &aside;
+            let aside = BufferId(buffers.len() as u32 - 1);
+            before.push(copy(&buffers, source, aside));
+            source = aside;
         }
-        let taken = outputs.contains(source) || updates.iter().filter(|u| *u == source).count() > 1;
-        if !taken && value.input_name().is_none() && replaces_in_place(&launches, *source, target_buffer, &buffers) {
-            rename(&mut launches, *source, target_buffer);
-        } else if *source != target_buffer {
-            launches.push(copy(&buffers, *source, target_buffer));
+        let computed = value.input_name().is_none() && roots.get(&source) == Some(&1);
+        if computed && replaces_in_place(&fused.regions, &accesses, source, target, &buffers) {
+            renamed.insert(source, target);
+        } else if source != target {
+            after.push(copy(&buffers, source, target));
         }
     }
     // An output that is an input keeps the value from before the updates only if it is copied first.
@@ -139,7 +141,7 @@ fn plan(step: &Step, fused: Fused, target: Target) -> Program {
                 let shape = buffers[source.0 as usize].shape.clone();
                 buffers.push(Buffer { kind: BufferKind::Output, shape, label: name.clone() });
                 let buffer = BufferId(buffers.len() as u32 - 1);
-                launches.insert(0, copy(&buffers, *source, buffer));
+                before.push(copy(&buffers, *source, buffer));
                 buffer
             }
             _ => {
@@ -149,6 +151,11 @@ fn plan(step: &Step, fused: Fused, target: Target) -> Program {
         };
         named.push((name.clone(), buffer));
     }
+    let fused_launches = fused.regions.into_iter().zip(fused.recomputed).map(|(mut region, recomputed)| {
+        region.buffers_mut().for_each(|b| *b = renamed.get(b).copied().unwrap_or(*b));
+        Launch { name: String::new(), region, recomputed }
+    });
+    let mut launches: Vec<Launch> = before.into_iter().rev().chain(fused_launches).chain(after).collect();
     let slots = assign_slots(&mut buffers, &launches);
     for (i, launch) in launches.iter_mut().enumerate() {
         launch.name = explain::launch_name(i, &launch.region);
@@ -171,63 +178,65 @@ fn describe(origin: &Origin, shape: &Shape) -> Buffer {
     }
 }
 
-/// The buffer of an update's target, which nothing may read.
-fn input_buffer(buffers: &mut Vec<Buffer>, input: &crate::graph::Tensor) -> BufferId {
-    let Some(op) = input.op_as::<crate::ops::input::Input>() else { unreachable!("checked by Step::check") };
-    let known = buffers.iter().position(|b| matches!(&b.kind, BufferKind::Input { name, .. } if *name == op.name));
-    let at = known.unwrap_or_else(|| {
-        buffers.push(describe(&Origin::Input(op.clone()), input.shape()));
-        buffers.len() - 1
-    });
-    BufferId(at as u32)
-}
-
-/// Whether the launch that writes `value` may write it straight into `old`.
-fn replaces_in_place(launches: &[Launch], value: BufferId, old: BufferId, buffers: &[Buffer]) -> bool {
-    let Some(writer) = launches.iter().position(|l| l.region.stores.iter().any(|s| s.buffer() == value)) else {
-        return false;
-    };
-    let region = &launches[writer].region;
-    let shape = &buffers[old.0 as usize].shape;
-    let whole = region.domain == shape.axes
-        && shape.axes == buffers[value.0 as usize].shape.axes
-        && region.stores.iter().any(|s| matches!(s, Store::Write { buffer, .. } if *buffer == value));
-    // A scan looks at other elements of its line.
-    let elementwise = !region.whole
-        && region.body.iter().all(|i| match &i.op {
-            RegionOp::Load(b) => *b != old || i.axes == region.domain,
-            RegionOp::Take { table, .. } => *table != old,
-            RegionOp::Linear(w) => w.buffer != old,
-            _ => true,
+/// The buffers of the updates' targets, some of which nothing may read.
+fn input_buffers(buffers: &mut Vec<Buffer>, step: &Step) -> Vec<BufferId> {
+    let name = |b: &Buffer| if let BufferKind::Input { name, .. } = &b.kind { Some(name.clone()) } else { None };
+    let known = buffers.iter().enumerate().filter_map(|(at, b)| Some((name(b)?, BufferId(at as u32))));
+    let known: HashMap<String, BufferId> = known.collect();
+    let target = |(input, _): &(Tensor, Tensor)| {
+        let Some(op) = input.op_as::<Input>() else { unreachable!("checked by Step::check") };
+        known.get(&op.name).copied().unwrap_or_else(|| {
+            buffers.push(describe(&Origin::Input(op.clone()), input.shape()));
+            BufferId(buffers.len() as u32 - 1)
         })
-        && (region.grain != region::Grain::Lane || region.keeps_channels_of(&[old], |_| true));
-    let later = launches[writer + 1..].iter().any(|l| l.region.reads().contains(&old));
-    whole && elementwise && !later
+    };
+    step.updates.iter().map(target).collect()
 }
 
-fn rename(launches: &mut [Launch], from: BufferId, to: BufferId) {
-    let new = |b: &mut BufferId| {
-        if *b == from {
-            *b = to;
-        }
-    };
-    for region in launches.iter_mut().map(|l| &mut l.region) {
-        for inst in &mut region.body {
-            match &mut inst.op {
-                RegionOp::Load(b) | RegionOp::Take { table: b, .. } => new(b),
-                RegionOp::Linear(w) => new(&mut w.buffer),
-                _ => {}
+/// Which regions touch a buffer, by their number.
+struct Accesses {
+    /// Who writes it element by element.
+    writer: HashMap<BufferId, usize>,
+    last_reader: HashMap<BufferId, usize>,
+    /// Buffers of which a region reads other elements or channels than those it is about to write.
+    elsewhere: HashSet<(usize, BufferId)>,
+}
+
+impl Accesses {
+    fn of(regions: &[Region]) -> Accesses {
+        let mut all = Accesses { writer: HashMap::new(), last_reader: HashMap::new(), elsewhere: HashSet::new() };
+        for (at, region) in regions.iter().enumerate() {
+            let written = region.stores.iter().filter(|s| matches!(s, Store::Write { .. }));
+            all.writer.extend(written.map(|s| (s.buffer(), at)));
+            all.last_reader.extend(region.reads().into_iter().map(|b| (b, at)));
+            if region.grain == region::Grain::Lane {
+                all.elsewhere.extend(region.mixed(|_| true).into_iter().map(|b| (at, b)));
             }
+            let elsewhere = region.body.iter().filter_map(|i| match &i.op {
+                // A scan looks at other elements of its line.
+                RegionOp::Load(b) => (region.whole || i.axes != region.domain).then_some(*b),
+                op => op.buffer(),
+            });
+            all.elsewhere.extend(elsewhere.map(|b| (at, b)));
         }
-        for store in &mut region.stores {
-            match store {
-                Store::Write { buffer, .. }
-                | Store::Reduce { buffer, .. }
-                | Store::Outer { buffer, .. }
-                | Store::Scatter { buffer, .. } => new(buffer),
-            }
-        }
+        all
     }
+}
+
+/// Whether the region that writes `value` may write it straight into `old`.
+fn replaces_in_place(
+    regions: &[Region],
+    accesses: &Accesses,
+    value: BufferId,
+    old: BufferId,
+    buffers: &[Buffer],
+) -> bool {
+    let Some(writer) = accesses.writer.get(&value) else { return false };
+    let region = &regions[*writer];
+    let [shape, new] = [old, value].map(|b| &buffers[b.0 as usize].shape);
+    let whole = region.domain == shape.axes && shape.axes == new.axes;
+    let later = accesses.last_reader.get(&old).is_some_and(|reader| reader > writer);
+    whole && !later && !accesses.elsewhere.contains(&(*writer, old))
 }
 
 /// A launch that copies one buffer to another of the same number of channels, broadcasting over axes.
@@ -255,6 +264,15 @@ fn copy(buffers: &[Buffer], from: BufferId, to: BufferId) -> Launch {
     Launch { name: String::new(), region, recomputed: 0 }
 }
 
+/// The slots that a lifetime has not met yet: one that is taken stays so.
+#[derive(Default)]
+struct Untried {
+    /// Slots there were when it last looked.
+    seen: usize,
+    /// Those of one size together.
+    ranges: Vec<Range<usize>>,
+}
+
 /// Gives temporaries with disjoint lifetimes the same slot, largest first into the tightest fit.
 fn assign_slots(buffers: &mut [Buffer], launches: &[Launch]) -> Vec<usize> {
     let mut first = vec![usize::MAX; buffers.len()];
@@ -267,26 +285,43 @@ fn assign_slots(buffers: &mut [Buffer], launches: &[Launch]) -> Vec<usize> {
             last[b] = last[b].max(at);
         }
     }
-    let mut order: Vec<usize> =
-        (0..buffers.len()).filter(|b| matches!(buffers[*b].kind, BufferKind::Temporary { .. })).collect();
+    let mut order: Vec<usize> = (0..buffers.len())
+        .filter(|b| matches!(buffers[*b].kind, BufferKind::Temporary { .. }) && first[*b] <= last[*b])
+        .collect();
     order.sort_by_key(|b| std::cmp::Reverse(buffers[*b].shape.lanes()));
-    let mut slots: Vec<(usize, Vec<(usize, usize)>)> = vec![];
+    // Size of every slot, and the lifetimes in it, first to last launch.
+    let mut slots: Vec<(usize, BTreeMap<usize, usize>)> = vec![];
+    let mut untried: HashMap<(usize, usize), Untried> = HashMap::new();
     for b in order {
         let span = (first[b], last[b]);
-        let free = |used: &[(usize, usize)]| used.iter().all(|u| u.1 < span.0 || span.1 < u.0);
-        let lanes = buffers[b].shape.lanes();
-        let fit = slots.iter().enumerate().filter(|(_, s)| free(&s.1)).min_by_key(|(_, s)| s.0);
-        let slot = match fit {
-            Some((i, _)) => i,
-            None => {
-                slots.push((lanes, vec![]));
-                slots.len() - 1
+        let free = |slot: usize| slots[slot].1.range(..=span.1).next_back().is_none_or(|(_, end)| *end < span.0);
+        let Untried { seen, ranges } = untried.entry(span).or_default();
+        for slot in *seen..slots.len() {
+            match ranges.last_mut() {
+                Some(range) if range.end == slot && slots[range.start].0 == slots[slot].0 => range.end += 1,
+                _ => ranges.push(slot..slot + 1),
             }
-        };
-        slots[slot].1.push(span);
+        }
+        *seen = slots.len();
+        // Younger slots are never larger.
+        let mut fit = None;
+        while let (None, Some(range)) = (fit, ranges.last_mut()) {
+            match range.next() {
+                Some(slot) => fit = free(slot).then_some(slot),
+                None => drop(ranges.pop()),
+            }
+        }
+        let slot = fit.unwrap_or_else(|| {
+            slots.push((buffers[b].shape.lanes(), BTreeMap::new()));
+            slots.len() - 1
+        });
+        slots[slot].1.insert(span.0, span.1);
         buffers[b].kind = BufferKind::Temporary { slot };
     }
-    slots.into_iter().map(|s| s.0).collect()
+    // What is written straight into the input it replaces has a buffer that no launch touches: it stays in the first slot.
+    let none = slots.is_empty();
+    let sizes = slots.into_iter().map(|s| s.0);
+    sizes.chain(none.then_some(1)).collect()
 }
 
 impl Program {
@@ -303,5 +338,36 @@ impl Program {
     /// Floating-point operations of one run.
     pub fn flops(&self) -> u64 {
         self.launches.iter().map(|l| l.region.flops()).sum()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::compile;
+    use crate::{Axis, Program, Shape, Step, Target, Tensor};
+
+    fn plan(updates: Vec<(Tensor, Tensor)>) -> Program {
+        compile(&Step { outputs: vec![], updates }, &Target::cpu()).unwrap()
+    }
+
+    /// What is computed straight into a parameter takes no memory besides, alone or where others share a slot.
+    #[test]
+    fn updates_in_place_take_no_memory() {
+        let [p, q] = [("p", 5000), ("q", 7)].map(|(name, width)| Tensor::parameter(name, Shape::new(&[], width)));
+        let halved = (p.clone(), &p * 0.5);
+        assert!(plan(vec![halved.clone()]).slots.iter().sum::<usize>() <= 1);
+        let row = Axis::new("row", 100);
+        let x = Tensor::data("x", Shape::new(&[&row], 7));
+        let program = plan(vec![halved, (q.clone(), &q - (&x * &q).sin().sum(&[&row]))]);
+        assert_eq!(program.slots, [7]);
+    }
+
+    /// Lines that are computed whole may replace what is not read along them.
+    #[test]
+    fn scans_of_others_replace_in_place() {
+        let row = Axis::new("row", 300);
+        let [s, x] = ["s", "x"].map(|name| Tensor::parameter(name, Shape::new(&[&row], 1)));
+        assert_eq!(plan(vec![(s.clone(), x.cumsum(&row))]).launches.len(), 1);
+        assert_eq!(plan(vec![(s.clone(), s.cumsum(&row))]).launches.len(), 2);
     }
 }

@@ -8,6 +8,7 @@ use crate::cost::Work;
 use crate::graph::{Axes, Axis};
 use crate::ops::Reduction;
 use crate::scalar::{DType, ScalarProgram};
+use std::collections::HashSet;
 use std::panic::Location;
 use std::sync::Arc;
 
@@ -73,6 +74,24 @@ pub enum RegionOp {
     },
 }
 
+impl RegionOp {
+    /// The buffer it reads.
+    pub fn buffer(&self) -> Option<BufferId> {
+        match self {
+            RegionOp::Load(b) | RegionOp::Take { table: b, .. } => Some(*b),
+            RegionOp::Linear(w) => Some(w.buffer),
+            _ => None,
+        }
+    }
+    fn buffer_mut(&mut self) -> Option<&mut BufferId> {
+        match self {
+            RegionOp::Load(b) | RegionOp::Take { table: b, .. } => Some(b),
+            RegionOp::Linear(w) => Some(&mut w.buffer),
+            _ => None,
+        }
+    }
+}
+
 /// One value of a region.
 #[derive(Clone, Debug)]
 pub struct Inst {
@@ -107,6 +126,14 @@ impl Store {
             | Store::Reduce { buffer, .. }
             | Store::Outer { buffer, .. }
             | Store::Scatter { buffer, .. } => *buffer,
+        }
+    }
+    fn buffer_mut(&mut self) -> &mut BufferId {
+        match self {
+            Store::Write { buffer, .. }
+            | Store::Reduce { buffer, .. }
+            | Store::Outer { buffer, .. }
+            | Store::Scatter { buffer, .. } => buffer,
         }
     }
     pub fn values(&self) -> Vec<InstId> {
@@ -166,35 +193,33 @@ impl Region {
     }
     /// Every buffer the region reads, weights and tables included.
     pub fn reads(&self) -> Vec<BufferId> {
-        let mut all: Vec<BufferId> = self
-            .body
-            .iter()
-            .filter_map(|i| match &i.op {
-                RegionOp::Load(b) | RegionOp::Take { table: b, .. } => Some(*b),
-                RegionOp::Linear(w) => Some(w.buffer),
-                _ => None,
-            })
-            .collect();
+        let mut all: Vec<BufferId> = self.body.iter().filter_map(|i| i.op.buffer()).collect();
         all.sort();
         all.dedup();
         all
     }
-    /// Whether all channels stay apart in what depends on the given buffers: of the instructions that count, each computes a
-    /// channel from the same channel. Then whoever computes one channel may replace it.
-    pub fn keeps_channels_of(&self, buffers: &[BufferId], counts: impl Fn(usize) -> bool) -> bool {
-        let mut depends = vec![false; self.body.len()];
-        for (at, inst) in self.body.iter().enumerate().filter(|(at, _)| counts(*at)) {
-            depends[at] = matches!(&inst.op, RegionOp::Load(b) if buffers.contains(b));
+    /// Every mention of a buffer, read or written.
+    pub fn buffers_mut(&mut self) -> impl Iterator<Item = &mut BufferId> {
+        let read = self.body.iter_mut().filter_map(|i| i.op.buffer_mut());
+        read.chain(self.stores.iter_mut().map(Store::buffer_mut))
+    }
+    /// The buffers of which a channel is needed to compute another one: of the instructions that count, some that depends on
+    /// them does more than compute every channel from the same channel. Whoever computes one channel must not replace it in them.
+    pub fn mixed(&self, counts: impl Fn(usize) -> bool) -> HashSet<BufferId> {
+        let mut mixed = vec![false; self.body.len()];
+        let mut buffers = HashSet::new();
+        for (at, inst) in self.body.iter().enumerate().rev().filter(|(at, _)| counts(*at)) {
             for input in &inst.inputs {
-                if depends[input.0 as usize] {
-                    if !matches!(inst.op, RegionOp::Map(_)) || self.inst(*input).channels != inst.channels {
-                        return false;
-                    }
-                    depends[at] = true;
-                }
+                let apart = matches!(inst.op, RegionOp::Map(_)) && self.inst(*input).channels == inst.channels;
+                mixed[input.0 as usize] |= mixed[at] || !apart;
+            }
+            if let RegionOp::Load(b) = inst.op
+                && mixed[at]
+            {
+                buffers.insert(b);
             }
         }
-        true
+        buffers
     }
     /// Arithmetic of one run.
     pub fn work(&self) -> Work {

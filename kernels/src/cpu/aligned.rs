@@ -6,7 +6,7 @@ use std::ptr::NonNull;
 /// Bytes of a cache line and of the widest vector.
 const ALIGN: usize = 64;
 
-/// A zero-initialised, growable `f32` buffer whose first element is 64-byte aligned. Pages of a large one take no memory
+/// A zero-initialised `f32` buffer whose first element is 64-byte aligned. Pages of a large one take no memory
 /// before they are written.
 #[derive(Debug)]
 pub struct AlignedVec {
@@ -45,13 +45,10 @@ impl AlignedVec {
         Some(AlignedVec { base, ptr: ptr.cast(), len })
     }
 
-    /// Grows to at least `len` elements; keeps the old contents, new elements are zero.
-    pub fn grow(&mut self, len: usize) {
-        if len > self.len {
-            let mut larger = AlignedVec::zeroed(len);
-            larger[..self.len].copy_from_slice(self);
-            *self = larger;
-        }
+    /// Grows to at least `len` elements, all zeros if it was shorter. Whether there was memory for it: else it is as before.
+    pub fn try_grow(&mut self, len: usize) -> bool {
+        let larger = if len > self.len { AlignedVec::try_zeroed(len) } else { return true };
+        larger.map(|larger| *self = larger).is_some()
     }
 
     pub fn as_ptr(&self) -> *const f32 {
@@ -121,16 +118,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn is_zeroed_aligned_and_keeps_its_contents() {
+    fn is_zeroed_and_aligned() {
         let mut v = AlignedVec::zeroed(5);
         assert_eq!(v.as_ptr() as usize % ALIGN, 0);
         assert_eq!(&v[..], &[0.0; 5]);
         v[4] = 7.0;
-        v.grow(1000);
+        assert!(v.try_grow(1000));
         assert_eq!(v.as_ptr() as usize % ALIGN, 0);
-        assert_eq!((v.len(), v[4], v[999]), (1000, 7.0, 0.0));
-        v.grow(3);
-        assert_eq!(v.clone().len(), 1000);
+        assert_eq!(&v[..], &[0.0; 1000]);
+        v[4] = 7.0;
+        assert!(v.try_grow(3) && !v.try_grow(usize::MAX));
+        assert_eq!((v.len(), v.clone()[4]), (1000, 7.0));
         assert!(AlignedVec::default().is_empty());
         for too_many in [1 << 58, usize::MAX / 4, usize::MAX] {
             assert!(AlignedVec::try_zeroed(too_many).is_none());

@@ -1,9 +1,10 @@
 //! Reductions over the rows of a channel-major tile.
 //!
 //! Sixteen partial results, one per row modulo 16, are combined in a fixed tree: the result does not depend on the
-//! instruction set.
+//! instruction set. Of long channels every block of rows has its own, and their results are combined in double precision.
 use super::Isa;
 use super::simd::{Kernel, Simd, launch};
+use std::ops::Add;
 
 /// Adds to `acc[c]` the sum of the first `rows` values of channel `c`.
 ///
@@ -33,8 +34,8 @@ pub unsafe fn raise(isa: Isa, acc: *mut f32, x: *const f32, len: usize) {
 }
 
 /// The larger of two numbers, NaN if either is.
-pub fn larger(a: f32, b: f32) -> f32 {
-    if a > b || a.is_nan() { a } else { b }
+pub fn larger<T: PartialOrd>(a: T, b: T) -> T {
+    if a > b || a.partial_cmp(&a).is_none() { a } else { b }
 }
 
 /// An associative operation.
@@ -44,7 +45,7 @@ trait Combine: Copy {
     /// # Safety
     /// As [`Simd`].
     unsafe fn vectors<S: Simd>(a: S::V, b: S::V) -> S::V;
-    fn scalars(a: f32, b: f32) -> f32;
+    fn scalars<T: PartialOrd + Add<Output = T>>(a: T, b: T) -> T;
 }
 
 #[derive(Clone, Copy)]
@@ -61,7 +62,7 @@ impl Combine for Sum {
         unsafe { S::add(a, b) }
     }
     #[inline(always)]
-    fn scalars(a: f32, b: f32) -> f32 {
+    fn scalars<T: PartialOrd + Add<Output = T>>(a: T, b: T) -> T {
         a + b
     }
 }
@@ -74,7 +75,7 @@ impl Combine for Max {
         unsafe { S::select(S::eq(a, a), S::max(a, b), a) }
     }
     #[inline(always)]
-    fn scalars(a: f32, b: f32) -> f32 {
+    fn scalars<T: PartialOrd + Add<Output = T>>(a: T, b: T) -> T {
         larger(a, b)
     }
 }
@@ -91,6 +92,8 @@ struct Reduce<C> {
 
 /// Partial results per channel.
 const PARTS: usize = 16;
+/// Rows of a block.
+const BLOCK: usize = 1024;
 
 impl<C: Combine> Kernel for Reduce<C> {
     type Out = ();
@@ -98,26 +101,28 @@ impl<C: Combine> Kernel for Reduce<C> {
     #[inline(always)]
     unsafe fn run<S: Simd>(&self) {
         for c in 0..self.channels {
-            // SAFETY: `c < channels`.
-            unsafe {
-                let total = self.channel::<S>(self.x.add(c * self.ldx));
-                let acc = self.acc.add(c);
-                *acc = C::scalars(*acc, total);
+            let mut total = f64::from(C::START);
+            for first in (0..self.rows).step_by(BLOCK) {
+                // SAFETY: `c < channels`, and the block ends with the channel.
+                let block = unsafe { self.block::<S>(self.x.add(c * self.ldx + first), BLOCK.min(self.rows - first)) };
+                total = C::scalars(total, f64::from(block));
             }
+            // SAFETY: `c < channels`.
+            unsafe { *self.acc.add(c) = C::scalars(*self.acc.add(c), total as f32) };
         }
     }
 }
 
 impl<C: Combine> Reduce<C> {
-    /// Reduces the channel at `x`.
+    /// Reduces the block of `rows` at `x`.
     ///
     /// # Safety
     /// `x` is valid for `rows` values, and the CPU has the instruction set of `S`.
     #[inline(always)]
-    unsafe fn channel<S: Simd>(&self, x: *const f32) -> f32 {
+    unsafe fn block<S: Simd>(&self, x: *const f32, rows: usize) -> f32 {
         const { assert!(S::LANES == PARTS || 2 * S::LANES == PARTS) };
         let vectors = PARTS / S::LANES;
-        let whole = self.rows / PARTS * PARTS;
+        let whole = rows / PARTS * PARTS;
         // SAFETY: rows up to `whole` are read in vectors, the rest is copied to a padded array.
         unsafe {
             let mut parts = [S::splat(C::START); 2];
@@ -126,9 +131,9 @@ impl<C: Combine> Reduce<C> {
                     parts[j] = C::vectors::<S>(parts[j], S::load(x.add(row + j * S::LANES)));
                 }
             }
-            if whole < self.rows {
+            if whole < rows {
                 let mut tail = [C::START; PARTS];
-                std::ptr::copy_nonoverlapping(x.add(whole), tail.as_mut_ptr(), self.rows - whole);
+                std::ptr::copy_nonoverlapping(x.add(whole), tail.as_mut_ptr(), rows - whole);
                 for j in 0..vectors {
                     parts[j] = C::vectors::<S>(parts[j], S::load(tail.as_ptr().add(j * S::LANES)));
                 }

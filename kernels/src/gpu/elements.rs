@@ -135,9 +135,10 @@ fn components(region: &Region) -> Vec<Component> {
             .sum();
         let lane: usize = values.iter().map(|v| costs[v.0 as usize]).sum();
         let channels = region.inst(values[0]).channels;
+        let mixed = region.mixed(|i| needed[i]);
         let possible = channels > 1
             && values.iter().all(|v| region.inst(*v).channels == channels && is_indexable(region, *v))
-            && region.keeps_channels_of(&stores.iter().map(|s| written[*s]).collect::<Vec<_>>(), |i| needed[i]);
+            && !stores.iter().any(|s| mixed.contains(&written[*s]));
         let by_lane = possible
             && if channels > WIDE {
                 lane < row.saturating_mul(4)

@@ -7,11 +7,10 @@ use crate::RunError;
 use crate::session::Executor;
 use raygrad_compiler::Program;
 use raygrad_compiler::fuse::TargetKind;
-use raygrad_compiler::ops::Reduction;
 use raygrad_compiler::plan::BufferKind;
 use raygrad_compiler::plan::region::BufferId;
 use raygrad_kernels::cpu::tile::{Chunk, Flat, Memory, TileProgram, lower, pack, run_tiles, split_flat};
-use raygrad_kernels::cpu::{AlignedVec, Isa, Products, larger, unblock};
+use raygrad_kernels::cpu::{AlignedVec, Isa, Products, unblock};
 use rayon::prelude::*;
 use std::cell::RefCell;
 use std::collections::HashMap;
@@ -24,7 +23,7 @@ const FLAT_TASK: usize = 16 * 1024;
 const SUM_TASK: usize = 16 * 1024;
 
 thread_local! {
-    /// Scratch of this thread, grown to the largest launch it has worked on.
+    /// Scratch of this thread, grown to the largest launch that was loaded.
     static SCRATCH: RefCell<AlignedVec> = RefCell::new(AlignedVec::zeroed(0));
 }
 
@@ -152,8 +151,25 @@ impl CpuExecutor {
         let packed = tiles().map(|t| t.packed).max().unwrap_or(0);
         let accumulators = tiles().map(|t| t.accumulated * t.chunks).max().unwrap_or(0);
         let lanes = program.buffers.iter().map(|b| b.shape.lanes()).collect();
+        for (launch, planned) in launches.iter().zip(&program.launches) {
+            self.reserve(launch, planned)?;
+        }
         let (packed, accumulators) = (zeroed("packed weights", packed)?, zeroed("sums of chunks", accumulators)?);
         Ok(Loaded { launches, places, lanes, packed, accumulators })
+    }
+
+    /// Has every thread reserve what it needs for a tile: one of a launch with scans along an axis holds all of it.
+    fn reserve(&self, launch: &Launch, planned: &raygrad_compiler::plan::Launch) -> Result<(), RunError> {
+        let tiles = launch.tiles.as_ref().map_or(0, |t| t.scratch);
+        let lanes = launch.flats.iter().map(Flat::scratch).fold(tiles, usize::max);
+        let grown = self.pool.broadcast(|_| SCRATCH.with_borrow_mut(|scratch| scratch.try_grow(lanes)));
+        if grown.into_iter().all(|grown| grown) {
+            return Ok(());
+        }
+        let line = planned.region.inner.as_ref().filter(|_| planned.region.whole);
+        let holds = line.map_or(String::new(), |axis| format!(", which holds all of `{axis}`"));
+        let what = format!("a tile of {}{holds}", planned.name);
+        Err(RunError::Memory { what, bytes: (lanes as u64).saturating_mul(4) })
     }
 
     /// Runs all launches; `done` is called after each.
@@ -178,11 +194,9 @@ impl CpuExecutor {
     }
 }
 
+/// Lanes of scratch, which loading the launch has reserved.
 fn with_scratch<T>(lanes: usize, f: impl FnOnce(&mut [f32]) -> T) -> T {
-    SCRATCH.with_borrow_mut(|scratch| {
-        scratch.grow(lanes);
-        f(&mut scratch[..lanes])
-    })
+    SCRATCH.with_borrow_mut(|scratch| f(&mut scratch[..lanes]))
 }
 
 fn run_flat(flat: &Flat, memory: Memory, isa: Isa) {
@@ -224,17 +238,16 @@ fn run_launch(
     }
     if tiles.direct {
         for a in &tiles.accumulators {
-            let start = if a.kind == Reduction::Sum { 0.0 } else { f32::NEG_INFINITY };
             let at = a.buffer.0 as usize;
             // SAFETY: the whole of a buffer that this launch alone writes.
-            unsafe { std::slice::from_raw_parts_mut(memory.buffers[at], lanes[at]).fill(start) };
+            unsafe { std::slice::from_raw_parts_mut(memory.buffers[at], lanes[at]).fill(a.start()) };
         }
     }
     let packed = &packed[..tiles.packed];
     let run = |c: usize, own: &mut [f32]| {
         if tiles.accumulated > 0 {
             for a in &tiles.accumulators {
-                own[a.at..a.at + a.len].fill(if a.kind == Reduction::Sum { 0.0 } else { f32::NEG_INFINITY });
+                own[a.at..a.at + a.len].fill(a.start());
             }
         }
         with_scratch(tiles.scratch, |scratch| {
@@ -276,10 +289,7 @@ fn combine(tiles: &TileProgram, all: &mut [f32], memory: Memory, lanes: &[usize]
             for c in (0..tiles.chunks - step).step_by(2 * step) {
                 // SAFETY: tasks own disjoint lane ranges of all chunks; the two chunks differ.
                 let (to, from) = unsafe { (columns.lanes(c, a.at, &range), columns.lanes(c + step, a.at, &range)) };
-                match a.kind {
-                    Reduction::Sum => to.iter_mut().zip(from).for_each(|(t, f)| *t += *f),
-                    Reduction::Max => to.iter_mut().zip(from).for_each(|(t, f)| *t = larger(*t, *f)),
-                }
+                a.combine(to, from);
             }
             step *= 2;
         }
@@ -332,6 +342,23 @@ impl Columns {
 mod tests {
     use super::*;
     use raygrad_compiler::{Axis, Shape, Step, Target, Tensor, compile};
+
+    /// A scan holds its whole axis in a tile: one that is too long for that is refused before it runs.
+    #[test]
+    fn a_line_that_fits_no_memory_is_refused() {
+        let sample = Axis::new("sample", 1 << 43);
+        let x = Tensor::index(&sample).to_f32() * Tensor::constant(&[1.0; 8]);
+        let step = Step { outputs: vec![("sum".into(), x.cumsum(&sample).sum(&[&sample]))], updates: vec![] };
+        let pool = Arc::new(rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap());
+        let added = CpuExecutor::new(pool, Products::F32).add(Arc::new(compile(&step, &Target::cpu()).unwrap()));
+        match added {
+            Err(RunError::Memory { what, bytes }) => {
+                assert_eq!(what, "a tile of 00_sample_scan_reduce, which holds all of `sample=8796093022208`");
+                assert!(bytes > 1 << 47, "{bytes}");
+            }
+            other => panic!("{other:?}"),
+        }
+    }
 
     /// Totals of many lines go straight to their buffer: no chunk has a copy of it.
     #[test]

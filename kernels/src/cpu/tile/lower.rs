@@ -86,6 +86,7 @@ fn empty(products: Products, inner: usize, line: usize, rows: usize, ld: usize) 
         packed: 0,
         accumulators: vec![],
         accumulated: 0,
+        batch: None,
         direct: false,
         chunks: 1,
     }
@@ -176,7 +177,7 @@ impl Lowering<'_> {
             }
             RegionOp::Const(bits) => {
                 let to = self.values.create(id, inst.channels, false);
-                self.out.constants.extend(bits.iter().enumerate().map(|(c, b)| (to + c as Place, *b)));
+                self.out.constants.extend(bits.iter().enumerate().map(|(c, b)| (to + c, *b)));
                 // Constants are written once per thread: nothing may take their place.
                 self.keep(id);
             }
@@ -211,7 +212,7 @@ impl Lowering<'_> {
             }
             RegionOp::CumSum { .. } | RegionOp::Shift { .. } => {
                 let (from, copy) = self.side_by_side(inst.inputs[0], true);
-                let from: Vec<Place> = (0..inst.channels).map(|c| from + (c * self.out.ld) as Place).collect();
+                let from: Vec<Place> = (0..inst.channels).map(|c| from + c * self.out.ld).collect();
                 let out = self.values.create(id, inst.channels, true);
                 self.out.ops.push(match &inst.op {
                     RegionOp::CumSum { reverse } => TileOp::CumSum { from, out, reverse: *reverse },
@@ -283,7 +284,7 @@ impl Lowering<'_> {
         let operands: Vec<Value> = inst.inputs.iter().map(|i| self.values.get(*i).clone()).collect();
         let overwritten = inst.inputs.iter().find_map(|i| self.values.overwrite(id, *i, inst.channels, full));
         let out = overwritten.unwrap_or_else(|| self.values.create(id, inst.channels, full));
-        let step = if full { self.out.ld as Place } else { 1 };
+        let step = if full { self.out.ld } else { 1 };
         let mut runs: Vec<Run> = vec![];
         for c in 0..inst.channels {
             let arg = |v: &Value| {
@@ -293,7 +294,7 @@ impl Lowering<'_> {
                 if repeats { RunArg::Splat(place) } else { RunArg::Lanes(place) }
             };
             let args: Vec<RunArg> = operands.iter().map(arg).collect();
-            let at = out + c as Place * step;
+            let at = out + c * step;
             match runs.last_mut() {
                 Some(run) if follows(run, at, &args, step) => run.channels += 1,
                 _ => runs.push(Run { out: at, channels: 1, args }),
@@ -369,21 +370,23 @@ impl Lowering<'_> {
             TileOp::Store(TileStore::Outer { .. } | TileStore::Scatter { .. }) => false,
             _ => true,
         };
-        let complete = self.out.tiles() / self.out.line_tiles();
-        self.out.direct = complete >= 2 * MAX_CHUNKS && self.out.ops.iter().all(per_line);
+        let (complete, short) = (self.out.tiles() / self.out.line_tiles(), self.out.line_tiles() <= SUMS);
+        self.out.direct = complete >= 2 * MAX_CHUNKS && short && self.out.ops.iter().all(per_line);
         if self.out.direct {
             self.out.accumulated = 0;
         }
         let units = if self.out.direct { complete } else { self.out.tiles() }.max(1);
         // A chunk's accumulators are worth a few tiles of work each.
         self.out.chunks = (units / CHUNK_TILES).next_power_of_two().clamp(units.min(2), MAX_CHUNKS);
+        self.out.batch = self.out.tiles_of_batch();
+        self.out.accumulated *= if self.out.batch.is_some() { 2 } else { 1 };
         self.out
     }
 }
 
 /// Whether a channel continues a run.
 fn follows(run: &Run, at: Place, args: &[RunArg], step: Place) -> bool {
-    let n = run.channels as Place;
+    let n = run.channels;
     let continues = |(old, new): (&RunArg, &RunArg)| match (old, new) {
         (RunArg::Lanes(a), RunArg::Lanes(b)) => a + n * step == *b,
         (RunArg::Splat(a), RunArg::Splat(b)) => a == b,

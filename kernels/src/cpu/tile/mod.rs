@@ -17,7 +17,7 @@ pub use flat::{Flat, FlatArg, split_flat};
 pub use lower::lower;
 pub use run::{Chunk, Memory, pack, run_tiles};
 
-use crate::cpu::Products;
+use crate::cpu::{Products, larger};
 use raygrad_compiler::ops::Reduction;
 use raygrad_compiler::plan::region::{BufferId, Weights};
 use raygrad_compiler::scalar::Prim;
@@ -32,6 +32,8 @@ const MAX_CHUNKS: usize = 16;
 const CHUNK_TILES: usize = 4;
 /// Channels from which an operand in pieces is multiplied piece by piece instead of being put together first.
 const WIDE: usize = 64;
+/// Sums that may follow one another in single precision, each rounded once more.
+const SUMS: usize = 64;
 /// Lanes that a pointwise program works on at a time: its temporaries stay in L1.
 const BLOCK: usize = 512;
 
@@ -70,7 +72,7 @@ impl View {
 }
 
 /// Where a channel of a value starts in the scratch arena, in lanes.
-type Place = u32;
+type Place = usize;
 
 /// A value in the scratch arena.
 #[derive(Clone, Debug, PartialEq)]
@@ -281,6 +283,24 @@ pub struct Accumulator {
     pub blocked: Option<(usize, usize, usize)>,
 }
 
+impl Accumulator {
+    /// Before anything is accumulated.
+    pub fn start(&self) -> f32 {
+        match self.kind {
+            Reduction::Sum => 0.0,
+            Reduction::Max => f32::NEG_INFINITY,
+        }
+    }
+
+    /// Accumulates what others have, lane by lane.
+    pub fn combine(&self, to: &mut [f32], from: &[f32]) {
+        match self.kind {
+            Reduction::Sum => to.iter_mut().zip(from).for_each(|(t, f)| *t += *f),
+            Reduction::Max => to.iter_mut().zip(from).for_each(|(t, f)| *t = larger(*t, *f)),
+        }
+    }
+}
+
 /// Weights to pack before a launch.
 #[derive(Clone, Debug)]
 pub struct Pack {
@@ -322,6 +342,9 @@ pub struct TileProgram {
     pub accumulators: Vec<Accumulator>,
     /// Lanes of one chunk's accumulators; if `direct`, there are none.
     pub accumulated: usize,
+    /// Tiles of a batch, if a chunk has several: each is summed apart, in the second half of the accumulators, and then added
+    /// to the first.
+    pub batch: Option<usize>,
     /// Reductions over the inner axis alone go straight to their buffer: chunks end where a line ends.
     pub direct: bool,
     pub chunks: usize,
@@ -339,6 +362,15 @@ impl TileProgram {
     /// Tiles that complete the lines they touch.
     pub fn line_tiles(&self) -> usize {
         if self.line < self.inner { 1 } else { self.segments() }
+    }
+    /// Tiles of a batch, if what a chunk sums up is many numbers: about as many batches as numbers of each, and none of fewer
+    /// rows than there are lanes to be added up.
+    fn tiles_of_batch(&self) -> Option<usize> {
+        let tiles = self.tiles().div_ceil(self.chunks);
+        let lines = if self.line < self.inner { self.rows / self.line } else { 1 };
+        let numbers = (tiles * lines).isqrt().max(SUMS);
+        let batch = numbers.div_ceil(lines).max(self.accumulated.div_ceil(self.rows));
+        (self.accumulated > 0 && batch < tiles).then_some(batch)
     }
     /// Tiles of chunk `c`.
     pub fn chunk_tiles(&self, c: usize) -> std::ops::Range<usize> {

@@ -6,6 +6,7 @@ mod transfer;
 use super::*;
 use crate::cpu::{Epilogue, Gemm, Isa, Operand, ROW_BLOCK, apply, gemm, pack_panels, raise};
 use raygrad_compiler::ops::sym_eig::jacobi;
+use std::ops::Range;
 
 /// Base addresses of a program's buffers, by [`BufferId`].
 #[derive(Clone, Copy)]
@@ -61,11 +62,35 @@ pub unsafe fn pack(pack: &Pack, isa: Isa, memory: Memory, packed: &mut [f32]) {
 pub unsafe fn run_tiles(program: &TileProgram, c: usize, chunk: &mut Chunk) {
     debug_assert!(chunk.scratch.len() >= program.scratch && chunk.accumulators.len() >= program.accumulated);
     for (place, bits) in &program.constants {
-        chunk.scratch[*place as usize] = f32::from_bits(*bits);
+        chunk.scratch[*place] = f32::from_bits(*bits);
     }
+    let all = program.chunk_tiles(c);
+    let Some(batch) = program.batch else {
+        // SAFETY: forwarded contract.
+        return unsafe { run_batch(program, all, chunk, 0) };
+    };
+    let half = program.accumulated / 2;
+    for first in all.clone().step_by(batch) {
+        for a in &program.accumulators {
+            chunk.accumulators[half + a.at..][..a.len].fill(a.start());
+        }
+        // SAFETY: forwarded contract.
+        unsafe { run_batch(program, first..all.end.min(first + batch), chunk, half) };
+        let (sums, batch) = chunk.accumulators.split_at_mut(half);
+        for a in &program.accumulators {
+            a.combine(&mut sums[a.at..][..a.len], &batch[a.at..][..a.len]);
+        }
+    }
+}
+
+/// Runs some tiles of a chunk, which accumulate from lane `at` on.
+///
+/// # Safety
+/// As [`run_tiles`].
+unsafe fn run_batch(program: &TileProgram, tiles: Range<usize>, chunk: &mut Chunk, at: usize) {
     let scratch = chunk.scratch.as_mut_ptr();
     let segments = program.segments();
-    for t in program.chunk_tiles(c) {
+    for t in tiles {
         let row0 = t % segments * program.rows;
         let mut rest = t / segments;
         let mut position = vec![0; program.outer.len()];
@@ -79,7 +104,7 @@ pub unsafe fn run_tiles(program: &TileProgram, c: usize, chunk: &mut Chunk) {
             memory: chunk.memory,
             isa: chunk.isa,
             packed: chunk.packed.as_ptr(),
-            accumulators: chunk.accumulators.as_mut_ptr(),
+            accumulators: chunk.accumulators[at..].as_mut_ptr(),
             scratch,
             row0,
             rows,
@@ -109,7 +134,7 @@ struct Tile<'a> {
 
 impl Tile<'_> {
     fn at(&self, place: Place) -> *mut f32 {
-        self.scratch.wrapping_add(place as usize)
+        self.scratch.wrapping_add(place)
     }
 
     /// The tile's lines: first row and rows of each.
@@ -223,7 +248,7 @@ impl Tile<'_> {
     }
 
     unsafe fn map(&self, program: &LaneProgram, runs: &[Run], full: bool) {
-        let temps = self.at(self.program.temps as Place);
+        let temps = self.at(self.program.temps);
         for run in runs {
             let lanes = if full { (run.channels - 1) * self.program.ld + self.padded } else { run.channels };
             let mut start = 0;
@@ -286,7 +311,7 @@ impl Tile<'_> {
             ldx: ld,
             contraction,
             products: pack.products,
-            scratch: self.at(self.program.pairs as Place),
+            scratch: self.at(self.program.pairs),
             panels,
             outputs,
             bias: bias.map_or(std::ptr::null(), |b| self.at(b).cast_const()),
@@ -308,7 +333,7 @@ impl Tile<'_> {
         let (rows, columns) = dims;
         let (contraction, outputs) = if transposed { (columns, rows) } else { (rows, columns) };
         let (len, step) = self.extent(full);
-        let product = self.at(self.program.temps as Place);
+        let product = self.at(self.program.temps);
         for o in 0..outputs {
             let out = self.at(out).wrapping_add(o * step);
             for k in 0..contraction {

@@ -59,11 +59,11 @@ impl Values {
     /// Scratch for something that dies with the current instruction.
     pub fn temporary(&mut self, channels: usize, full: bool) -> (Place, usize) {
         let lanes = self.lanes(channels, full);
-        (self.arena.take(lanes) as Place, lanes)
+        (self.arena.take(lanes), lanes)
     }
 
     pub fn release_temporary(&mut self, (place, lanes): (Place, usize)) {
-        self.arena.give(place as usize, lanes);
+        self.arena.give(place, lanes);
     }
 
     /// A new value for `id`, in channels next to each other.
@@ -72,9 +72,9 @@ impl Values {
         let start = self.arena.take(lanes);
         self.storage.push(Storage { start, lanes, users: self.users(id) });
         let step = if full { self.ld } else { 1 };
-        let places = (0..channels).map(|c| (start + c * step) as Place).collect();
+        let places = (0..channels).map(|c| start + c * step).collect();
         self.values[id.0 as usize] = Some((Value { places, full }, vec![self.storage.len() - 1]));
-        start as Place
+        start
     }
 
     /// A value for `id` that is `from` overwritten: only where `from` has no other reader and the same layout.
@@ -82,7 +82,7 @@ impl Values {
         let (value, storage) = self.values[from.0 as usize].as_ref()?;
         let [only] = storage[..] else { return None };
         let sole = self.storage[only].users == 1 && value.full == full && value.places.len() == channels;
-        let start = self.storage[only].start as Place;
+        let start = self.storage[only].start;
         let whole = self.storage[only].lanes == self.lanes(channels, full) && self.contiguous(value) == Some(start);
         if !(sole && whole) {
             return None;
@@ -124,9 +124,9 @@ impl Values {
 
     /// The first place, if the channels follow each other.
     pub fn contiguous(&self, value: &Value) -> Option<Place> {
-        let step = if value.full { self.ld as u32 } else { 1 };
+        let step = if value.full { self.ld } else { 1 };
         let first = *value.places.first()?;
-        value.places.iter().enumerate().all(|(c, p)| *p == first + c as u32 * step).then_some(first)
+        value.places.iter().enumerate().all(|(c, p)| *p == first + c * step).then_some(first)
     }
 
     pub fn arena_len(&self) -> usize {

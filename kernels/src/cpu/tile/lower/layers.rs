@@ -102,7 +102,7 @@ impl Lowering<'_> {
         let mut all: Vec<(Place, usize, usize)> = vec![];
         for (c, place) in value.places.iter().enumerate() {
             match all.last_mut() {
-                Some((first, _, n)) if *first + (*n * self.out.ld) as Place == *place => *n += 1,
+                Some((first, _, n)) if *first + *n * self.out.ld == *place => *n += 1,
                 _ => all.push((*place, c, 1)),
             }
         }

@@ -7,13 +7,14 @@ impl Tile<'_> {
         for (c, place) in from.iter().enumerate() {
             let (x, y) = (self.at(*place), self.at(out).wrapping_add(c * self.program.ld));
             for (first, rows) in self.lines(self.program.line) {
-                let mut sum = 0.0f32;
+                // A long sum of single-precision sums would lose digits; to add up doubles takes no longer.
+                let mut sum = 0.0f64;
                 for i in 0..rows {
                     let r = first + if reverse { rows - 1 - i } else { i };
                     // SAFETY: rows of a full channel.
                     unsafe {
-                        *y.add(r) = sum;
-                        sum += *x.add(r);
+                        *y.add(r) = sum as f32;
+                        sum += f64::from(*x.add(r));
                     }
                 }
             }

@@ -2,7 +2,6 @@
 
 use super::*;
 use crate::cpu::{larger, outer, rows_max, rows_sum};
-use std::ops::Range;
 
 impl Tile<'_> {
     pub(super) unsafe fn load(&self, view: &View, to: Place, channels: usize, full: bool) {
@@ -116,7 +115,7 @@ impl Tile<'_> {
                             rows,
                             g,
                             products: self.program.products,
-                            scratch: self.at(self.program.pairs as Place),
+                            scratch: self.at(self.program.pairs),
                         };
                         outer(self.isa, args);
                     }
@@ -158,7 +157,7 @@ impl Tile<'_> {
             }
         };
         let ld = self.program.ld;
-        let side_by_side = value.places.windows(2).all(|w| w[1] == w[0] + ld as Place);
+        let side_by_side = value.places.windows(2).all(|w| w[1] == w[0] + ld);
         let at_once = view.inner == 0 && view.elements == 1 && value.full && side_by_side && kind == Reduction::Sum;
         for (first, rows, lane) in self.runs(view) {
             let base = base.wrapping_add(lane);
