@@ -51,7 +51,7 @@ fn of_rows_by_many_columns() {
     check("sum", &x, &x.sum(&[&row]), |_| 2e4);
 }
 
-/// So many lines that each goes straight to its buffer, were they shorter.
+/// So many lines that each goes straight to its buffer.
 #[test]
 fn of_long_lines() {
     let (line, row) = (Axis::new("line", 40), Axis::new("row", 200_000));
@@ -60,10 +60,11 @@ fn of_long_lines() {
 }
 
 #[test]
-fn cumulative_ones_and_their_totals() {
+fn of_lines_that_are_a_tile() {
     let row = Axis::new("row", 1_000_000);
     let x = Tensor::data("x", Shape::new(&[&row], 1));
     check("cumsum", &x, &x.cumsum(&row), |i| i as f64);
     check("reverse", &x, &x.reverse_cumsum(&row), |i| (999_999 - i) as f64);
+    check("neighbours", &x, &(&x + x.shift(&row, 1)).sum(&[&row]), |_| 2e6 - 1.0);
     check("total", &x, &x.cumsum(&row).sum(&[&row]), |_| 1e6 * 999_999.0 / 2.0);
 }

@@ -370,8 +370,8 @@ impl Lowering<'_> {
             TileOp::Store(TileStore::Outer { .. } | TileStore::Scatter { .. }) => false,
             _ => true,
         };
-        let (complete, short) = (self.out.tiles() / self.out.line_tiles(), self.out.line_tiles() <= SUMS);
-        self.out.direct = complete >= 2 * MAX_CHUNKS && short && self.out.ops.iter().all(per_line);
+        let complete = self.out.tiles() / self.out.line_tiles();
+        self.out.direct = complete >= 2 * MAX_CHUNKS && self.out.ops.iter().all(per_line);
         if self.out.direct {
             self.out.accumulated = 0;
         }
