@@ -9,8 +9,8 @@
 //! With hierarchical sampling the fine field's picture gives a second render term, of the same weight.
 //!
 //! T_b is the rigid motion of frame b fitted to the map (L2G-NeRF's global alignment, the invertible warp's rigidity prior).
-//! Every step sees all frames, by default the same pixels in each, or those that a map of errors draws (`error_map.rs`). The fitted poses are kept as a state: near and far follow them in the
-//! next step, and evaluation starts from them.
+//! Every step sees all frames, by default the same pixels in each, or those that a map of errors draws (`error_map.rs`). The
+//! fitted poses are kept as a state: near and far follow them in the next step, and evaluation starts from them.
 
 use super::error_map::ErrorMap;
 use super::rays::{Cameras, ImageSize, Rays, range_of};
