@@ -151,7 +151,7 @@ impl RunFolder {
         }
         let mut layered = RunFolder::held(path)?.ok_or_else(|| no_run(&format!("it holds no {CONFIG}")))?;
         if !path.join(MANIFEST).exists() {
-            return Err(no_run("it was stopped before its first checkpoint"));
+            return Err(no_run("it has no checkpoint yet"));
         }
         let name = path.canonicalize().ok().and_then(|p| Some(p.file_name()?.to_string_lossy().into_owned()));
         layered.name = name.unwrap_or(layered.name);

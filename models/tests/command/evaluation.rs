@@ -225,7 +225,7 @@ fn runs_that_are_none() {
     mentions(&w.refuse(&["eval", "run", "--data", "empty"]), &["empty is not a scene"]);
     mentions(&w.refuse(&["eval", "run", "--data", "moved", "--device", "gpu"]), &["`raygrad devices`"]);
     std::fs::remove_file(w.path("run/checkpoint.json")).unwrap();
-    mentions(&w.refuse(&["eval", "run"]), &["no run in run", "before its first checkpoint"]);
+    mentions(&w.refuse(&["eval", "run"]), &["no run in run", "no checkpoint yet"]);
     assert_eq!(w.left_behind(), ["empty", "moved", "run"]);
 }
 
