@@ -1,6 +1,7 @@
 //! The larger of two values, NaN if either is; on ties the gradient goes to `a`.
 
 use super::pointwise::{binary, unary};
+use super::reduce::larger;
 use super::{Pointwise, Sample, map};
 use crate::graph::Tensor;
 use crate::reference::Lane;
@@ -17,8 +18,7 @@ impl Pointwise for Max {
         &[Some(DType::F32), Some(DType::F32)]
     }
     fn eval(&self, a: &[Lane]) -> Lane {
-        let (x, y) = (a[0].f(), a[1].f());
-        Lane::F(if x > y || x.is_nan() { x } else { y })
+        Lane::F(larger(a[0].f(), a[1].f()))
     }
     fn vjp(&self, x: &[Tensor], _: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
         let (first, zero) = (x[0].greater_equal(&x[1]), Tensor::scalar(0.0));

@@ -1,6 +1,6 @@
 //! `raygrad bench`: how long a training step takes, launch by launch, against what the device could do at best.
 
-use crate::launches::{medians, profile, warm};
+use crate::launches::{medians, profile, training, warm_up};
 use crate::{Choice, print};
 use clap::Args;
 use raygrad::config::ConfigError;
@@ -94,7 +94,8 @@ pub fn run(args: &BenchArgs) -> anyhow::Result<ExitCode> {
     }
     // A file that cannot be written is found out before the steps.
     let trace = args.trace.as_deref().map(trace_file).transpose()?;
-    let mut trainer = warm(&mut experiment)?;
+    let mut trainer = training(&mut experiment)?;
+    warm_up(&mut *trainer)?;
     let settings = &experiment.layered.settings;
     let threads = settings.run.threads.of(std::thread::available_parallelism().map_or(1, usize::from));
     let device = trainer.learner().device().clone();

@@ -1,7 +1,7 @@
 //! `raygrad explain`: what an experiment compiles to. With `--device` what it compiles to there, and what every launch takes;
 //! otherwise no device is asked.
 
-use crate::launches::{medians, profile, warm};
+use crate::launches::{medians, profile, training, warm_up};
 use crate::{Choice, output_folder, print};
 use clap::{Args, ValueEnum};
 use raygrad::Experiment;
@@ -116,12 +116,13 @@ struct Plan {
 
 /// What the device of an experiment runs, and how fast unless something else is asked for.
 fn on_device(experiment: &mut Experiment, emit: Option<Artefact>) -> anyhow::Result<(Plan, Step, Duration)> {
-    let mut trainer = warm(experiment)?;
+    let mut trainer = training(experiment)?;
     let device = trainer.learner().device().clone();
     let program = trainer.learner().program(trainer.training_program()).clone();
     let measured = match emit {
         Some(_) => None,
         None => {
+            warm_up(&mut *trainer)?;
             let seconds = medians(&profile(&mut *trainer)?);
             let gflops = device.peak_matrix_gflops()?.map_or_else(|| device.peak_gflops(), Ok)?;
             Some(Measured { seconds, gflops, gbytes: device.peak_gbytes()? })

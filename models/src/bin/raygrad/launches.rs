@@ -10,18 +10,22 @@ const WARM_UP: usize = 3;
 /// Steps whose launches are timed.
 const PROFILED: usize = 7;
 
-/// The training of an experiment, some steps of it done.
-pub fn warm(experiment: &mut Experiment) -> Result<Box<dyn Training>, raygrad::Error> {
+/// The training of an experiment, for its steps alone.
+pub fn training(experiment: &mut Experiment) -> Result<Box<dyn Training>, raygrad::Error> {
     if let Some(scene) = &mut experiment.layered.settings.scene {
         // A step needs the training views alone.
         (scene.val_views, scene.test_views) = (Count::Of(0), Count::Of(0));
     }
-    let mut trainer = experiment.training()?;
+    experiment.training()
+}
+
+/// Does the steps before those that are timed.
+pub fn warm_up(trainer: &mut dyn Training) -> Result<(), raygrad::Error> {
     for _ in 0..WARM_UP {
         trainer.step()?;
         trainer.wait()?;
     }
-    Ok(trainer)
+    Ok(())
 }
 
 /// Seconds of every launch of some steps.
