@@ -131,21 +131,31 @@ fn main() -> anyhow::Result<()> {
         }
         device = own.values().flatten().last().map(|b| b.device.clone()).context("no device was asked for")?;
         report(&mut text, work, &own, &others)?;
+        args.write(&device, &text)?;
     }
     args.narrow(&mut text)?;
-    let words: Vec<&str> = device.split(|c: char| !c.is_ascii_alphanumeric()).filter(|w| !w.is_empty()).collect();
-    let file = args.out.join(format!("{}.md", words.join("-")));
-    let steps = args.steps.map_or(String::new(), |n| format!(" --steps {n}"));
-    let head =
-        format!("# {device}\n\n`benches/gpu.sh --rounds {} --scale {}{steps}`, medians.\n", args.rounds, args.scale);
-    std::fs::create_dir_all(&args.out).with_context(|| format!("cannot make {}", args.out.display()))?;
-    std::fs::write(&file, head + &text).with_context(|| format!("cannot write {}", file.display()))?;
+    let file = args.write(&device, &text)?;
     print!("{text}");
     println!("written to {}", file.display());
     Ok(())
 }
 
 impl Args {
+    /// Writes what there is so far.
+    fn write(&self, device: &str, text: &str) -> anyhow::Result<PathBuf> {
+        let words: Vec<&str> = device.split(|c: char| !c.is_ascii_alphanumeric()).filter(|w| !w.is_empty()).collect();
+        let file = self.out.join(format!("{}.md", words.join("-")));
+        let steps = self.steps.map_or(String::new(), |n| format!(" --steps {n}"));
+        let devices = self.devices.join(",");
+        let (rounds, scale) = (self.rounds, self.scale);
+        let head = format!(
+            "# {device}\n\n`benches/gpu.sh --rounds {rounds} --scale {scale}{steps} --devices {devices}`, medians.\n"
+        );
+        std::fs::create_dir_all(&self.out).with_context(|| format!("cannot make {}", self.out.display()))?;
+        std::fs::write(&file, head + text).with_context(|| format!("cannot write {}", file.display()))?;
+        Ok(file)
+    }
+
     /// `None` where the device lacks the precision.
     fn own(&self, work: &Work, device: &str, precision: &str) -> anyhow::Result<Option<Bench>> {
         let rows = if quick() { 64.0 } else { (work.rows * self.scale).round() };
