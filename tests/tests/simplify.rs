@@ -1,7 +1,8 @@
 //! Simplification keeps every value: the simplified graph against the recorded one, both in the f64 reference.
 
 use raygrad_compiler::autodiff::grad;
-use raygrad_compiler::graph::{Axis, Shape, Tensor};
+use raygrad_compiler::graph::{Axis, Shape, Tensor, topological};
+use raygrad_compiler::ops::pick::concat;
 use raygrad_compiler::ops::{map, registry};
 use raygrad_compiler::reference::{Array, Bindings};
 use raygrad_compiler::simplify::simplify;
@@ -30,6 +31,37 @@ fn every_op_and_its_gradients_keep_their_values() {
             assert!(error < 1e-11, "{}: `{name}` changed by {error:.2e}", sample.name);
         }
     }
+}
+
+/// A code that enters two layers of a network gets its gradient from sums over rows: no layer brings those of every row back to
+/// the code.
+#[test]
+fn gradients_of_codes_are_summed_before_layers() {
+    let (frame, row) = (Axis::new("frame", 2), Axis::new("row", 12));
+    let data = Tensor::data("x", Shape::new(&[&frame, &row], 3));
+    let parameter = |name: &str, shape: Shape| Tensor::parameter(name, shape);
+    let code = parameter("code", Shape::new(&[&frame], 4));
+    let (first, second) = (parameter("first", Shape::new(&[], (7, 5))), parameter("second", Shape::new(&[], (12, 2))));
+    let x = concat([&data, &code]);
+    let hidden = x.linear(&first).sin();
+    let y = concat([&hidden, &x]).linear(&second);
+    let gradient = grad(&total(&(&y * &y)), &[&code]).remove(0);
+    let step = Step { outputs: vec![("code".into(), gradient)], updates: vec![] };
+    let simple = simplify(&step);
+    let mut bindings = Bindings::new();
+    for (name, shape) in
+        [("x", data.shape()), ("code", code.shape()), ("first", first.shape()), ("second", second.shape())]
+    {
+        let values = (0..shape.lanes()).map(|i| ((i * 37 + 11) % 23) as f64 * 0.05 - 0.5).collect();
+        bindings.insert(name.into(), Array::floats(shape, values));
+    }
+    let (found, expected) = (reference(&simple, &bindings), reference(&step, &bindings));
+    assert!(worst(&found[0], &expected[0], 1e-6) < 1e-12, "{found:?} instead of {expected:?}");
+    let to_code = |t: &Tensor| t.op().name() == "linear_transposed" && t.axes().contains(&row) && t.width() >= 4;
+    let wide: Vec<Tensor> = topological(simple.roots()).into_iter().filter(to_code).collect();
+    // What is left brings gradients back to the five hidden channels.
+    assert!(wide.iter().all(|t| t.width() == 5), "{wide:?}");
+    assert_eq!(wide.len(), 1, "{wide:?}");
 }
 
 /// Two functions may each make an axis of the same name for a sum of their own.

@@ -4,7 +4,9 @@
 //! per frame, not per row. The same holds backwards: the gradient of the code is `(sum of row gradients) W2^T`, and that
 //! of its weights `code (sum of row gradients)`, so whatever sums first is moved inwards.
 
+use super::is_map;
 use crate::graph::{Axes, Channels, Tensor};
+use crate::ops::add::Add;
 use crate::ops::linear::Linear;
 use crate::ops::outer::Outer;
 use crate::ops::pick::Pick;
@@ -12,7 +14,11 @@ use crate::ops::reduce::{Broadcast, Reduce};
 use crate::ops::{Form, Reduction};
 
 pub(super) fn rewrite(t: &Tensor) -> Option<Tensor> {
-    let simpler = forward(t).or_else(|| slice_of_transposed(t)).or_else(|| sum_of_linear(t)).or_else(|| weights(t))?;
+    let simpler = forward(t)
+        .or_else(|| slice_of_transposed(t))
+        .or_else(|| sum_of_linear(t))
+        .or_else(|| sum_of_linears(t))
+        .or_else(|| weights(t))?;
     debug_assert_eq!(simpler.shape(), t.shape(), "a split changed the shape of {t:?} to {simpler:?}");
     Some(simpler)
 }
@@ -90,6 +96,42 @@ fn sum_of_linear(t: &Tensor) -> Option<Tensor> {
         return None;
     }
     Some(Tensor::record(Linear { transposed }, &[&x.sum_over(over), w]))
+}
+
+/// The sum of some channels of added products, as of a code that enters several layers, is added after summing each.
+fn sum_of_linears(t: &Tensor) -> Option<Tensor> {
+    let over = &t.op_as::<Reduce>().filter(|r| r.kind == Reduction::Sum)?.over;
+    let summed = &t.inputs()[0];
+    let pick = summed.op_as::<Pick>().filter(|_| summed.inputs().len() == 1);
+    let added = if pick.is_some() { &summed.inputs()[0] } else { summed };
+    let products = terms(added)?;
+    if products.iter().any(|p| p.inputs()[1].axes().iter().any(|a| over.contains(a))) {
+        return None;
+    }
+    let each = products.into_iter().map(|product| {
+        let part = match pick {
+            Some(_) => Tensor::record_arc(summed.op().clone(), vec![product]),
+            None => product,
+        };
+        part.sum_over(over)
+    });
+    each.reduce(|a, b| a + b)
+}
+
+/// The layers of as many axes whose sum this is, if it is one.
+fn terms(t: &Tensor) -> Option<Vec<Tensor>> {
+    if !is_map::<Add>(t) {
+        return None;
+    }
+    let mut all = vec![];
+    for x in t.inputs() {
+        match x.op().form() {
+            _ if x.axes() != t.axes() => return None,
+            Form::Linear { .. } if x.inputs()[0].axes() == t.axes() => all.push(x.clone()),
+            _ => all.extend(terms(x)?),
+        }
+    }
+    Some(all)
 }
 
 /// `sum x_i d_o` with x constant along some summed axes sums d first; a concatenated x gives its rows part by part.

@@ -6,7 +6,7 @@ use super::builder::{Kind, Memory, Value};
 use super::give::{Epilogue, Place, place, through_columns};
 use super::memory::Emit;
 use super::reduce::{combine, neutral};
-use super::tile::{Along, Operand, Staged, Tile};
+use super::tile::{Along, Operand, Staged, Tile, plus};
 use naga::{BuiltIn, MathFunction};
 use raygrad_compiler::ops::Reduction;
 
@@ -26,7 +26,7 @@ pub(super) fn multiply(
     let workgroups = e.b.built_in("workgroups", BuiltIn::NumWorkGroups);
     let (workgroups, one) = (e.b.component(workgroups, 0), e.b.u(1));
     let one = e.b.math(MathFunction::Min, &[workgroups, one]);
-    let mut b = Staged::new(e, tile, "tile_b", tile.n, b);
+    let mut b = Staged::new(e, tile, "tile_b", (tile.n, 1), b);
     let vectors = tile.own_m / 4;
     let sums = e.b.private("sum", Kind::F32, true, tile.n * vectors);
     let zero = e.b.f(0.0);
@@ -133,9 +133,4 @@ fn fill(e: &mut Emit, memory: Memory, count: u32, value: Value) {
         let at = e.b.u(i);
         e.b.store(memory, at, value);
     }
-}
-
-fn plus(e: &mut Emit, value: Value, offset: u32) -> Value {
-    let offset = e.b.u(offset);
-    e.b.add(value, offset)
 }

@@ -9,6 +9,7 @@ use super::layout::{Layout, Limits};
 use super::memory::{Emit, is_run};
 use super::parts::{empty, push_load};
 use super::reduce::{self, combine_all, neutral};
+use super::tile::plus;
 use super::{Kernel, LowerError};
 use naga::MathFunction as Math;
 use raygrad_compiler::graph::{Axis, Shape};
@@ -210,18 +211,24 @@ impl Layer<'_> {
     fn combined(&self, e: &mut Emit, kind: Reduction, row: Value, value: Value) -> Value {
         let end = e.b.u(self.rows);
         let nothing = neutral(&mut e.b, kind);
+        let certain = self.rows.is_multiple_of(self.tile.m);
+        let counted = |e: &mut Emit, row: Value, value: Value| {
+            let inside = e.b.less(row, end);
+            e.b.select(inside, value, nothing)
+        };
         let mut all = vec![];
         for lane in 0..4 {
-            let mut own = if value.vector { e.b.component(value, lane) } else { value };
-            if !self.rows.is_multiple_of(self.tile.m) {
-                let offset = e.b.u(lane);
-                let number = e.b.add(row, offset);
-                let inside = e.b.less(number, end);
-                own = e.b.select(inside, own, nothing);
-            }
-            all.push(own);
+            let own = if value.vector { e.b.component(value, lane) } else { value };
+            all.push(match certain || self.in_fours() {
+                true => own,
+                false => {
+                    let row = plus(e, row, lane);
+                    counted(e, row, own)
+                }
+            });
         }
-        combine_all(&mut e.b, kind, &all)
+        let all = combine_all(&mut e.b, kind, &all);
+        if certain || !self.in_fours() { all } else { counted(e, row, all) }
     }
 
     /// Writes the region's values of one column at four rows.

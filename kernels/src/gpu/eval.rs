@@ -6,7 +6,7 @@
 
 use super::builder::{Memory, Value};
 use super::channels::{Linear, Run, affine, is_indexable, runs_of, sequence};
-use super::memory::{Emit, Position, is_run, kind};
+use super::memory::{Emit, Position, is_constant, is_run, kind};
 use super::scalar::larger;
 use super::{eigen, scalar};
 use naga::BinaryOperator as Op;
@@ -184,6 +184,13 @@ impl<'r> Values<'r> {
             let element = self.at[0].element(e, &axes);
             let at = e.index(buffer, channel, element);
             return e.load_four(buffer, at);
+        }
+        // Rows of a tile are no rows of a buffer in memory.
+        let of_domain = |rows: &&Axes| rows.is_subset(&self.region.domain);
+        if self.neighbours.iter().filter(of_domain).any(|rows| is_constant(&axes, rows)) {
+            let element = self.at[0].element(e, &axes);
+            let at = e.index(buffer, channel, element);
+            return e.load(buffer, at);
         }
         self.gather(e, |e, position| {
             let element = position.element(e, &axes);

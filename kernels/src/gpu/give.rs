@@ -7,6 +7,10 @@ use super::memory::Emit;
 use super::reduce::{combine, combine_lanes, neutral};
 use super::tile::Tile;
 use raygrad_compiler::ops::Reduction;
+use std::collections::VecDeque;
+
+/// Strips for which what they need from memory is on its way at a time.
+const AHEAD: usize = 3;
 
 /// Where in the tile sums of four neighbouring m of one n are: the first m, and n.
 #[derive(Clone, Copy)]
@@ -210,14 +214,15 @@ impl Strips {
         let rounds: Vec<(usize, usize)> = (0..sums.len()).flat_map(|j| (0..strips).map(move |i| (j, i))).collect();
         let kinds = epilogue.kinds();
         let totals = Totals::new(e, &kinds, self.mine.len());
-        let mut next = self.places(e, rounds[0], first);
-        epilogue.ahead(e, &next);
+        let mut ahead = VecDeque::new();
+        for round in rounds.iter().take(AHEAD) {
+            ahead.push_back(self.read(e, *round, first, epilogue));
+        }
         for (round, (j, i)) in rounds.iter().enumerate() {
             let found = self.pass(e, sums[*j].chunks(matrices).nth(*i).unwrap_or_default());
-            let here = next.clone();
-            if let Some(after) = rounds.get(round + 1) {
-                next = self.places(e, *after, first);
-                epilogue.ahead(e, &next);
+            let here = ahead.pop_front().unwrap_or_default();
+            if let Some(after) = rounds.get(round + AHEAD) {
+                ahead.push_back(self.read(e, *after, first, epilogue));
             }
             let values = epilogue.sums(e, &here, &found);
             totals.add(e, &values);
@@ -229,6 +234,19 @@ impl Strips {
                 }
             }
         }
+    }
+
+    /// Reads what the sums of a strip need, and returns where in the tile they are.
+    fn read(
+        &self,
+        e: &mut Emit,
+        round: (usize, usize),
+        first: (Value, Value),
+        epilogue: &mut dyn Epilogue,
+    ) -> Vec<Place> {
+        let places = self.places(e, round, first);
+        epilogue.ahead(e, &places);
+        places
     }
 
     /// Where in the tile the vectors of this invocation are in strip `i` of columns `j`.

@@ -24,14 +24,13 @@ pub(super) fn kernels(
     let (RegionOp::Linear(weights), RegionOp::Load(input)) = (&inst.op, &region.inst(inst.inputs[0]).op) else {
         unreachable!("the part of a layer holds a layer of a loaded input")
     };
-    let (terms, columns) =
-        if weights.transposed { (weights.columns, weights.rows) } else { (weights.rows, weights.columns) };
+    let (terms, columns) = sides(weights);
     // One matrix for every element of the weights' axes; the rows are the other axes.
     let batch_axes = layout.shape(weights.buffer).axes.clone();
     let row_axes = region.domain.minus(&batch_axes);
-    let stretches = split(columns);
-    let several = stretches.len() > 1;
     let rows = row_axes.elements();
+    let stretches = split(&limits, (rows, columns, terms), batch_axes.elements(), terms);
+    let several = stretches.len() > 1;
     let (mut weights, mut all) = (*weights, vec![]);
     let multiplied = limits.matrices().is_some() && weights.rows.min(weights.columns) > 32;
     if multiplied
@@ -69,9 +68,16 @@ pub(super) fn kernels(
 }
 
 /// Whether a layer's kernel combines what follows from it over all rows: it has one matrix, and all columns in one kernel.
-pub(super) fn has_totals(layout: &Layout, region: &Region, linear: InstId) -> bool {
+pub(super) fn has_totals(layout: &Layout, limits: &Limits, region: &Region, linear: InstId) -> bool {
     let RegionOp::Linear(weights) = &region.inst(linear).op else { return false };
-    layout.shape(weights.buffer).axes.is_empty() && split(region.inst(linear).channels).len() == 1
+    let (terms, columns) = sides(weights);
+    let stretches = split(limits, (region.domain.elements(), columns, terms), 1, terms);
+    layout.shape(weights.buffer).axes.is_empty() && stretches.len() == 1
+}
+
+/// Terms and columns of a layer.
+fn sides(weights: &Weights) -> (usize, usize) {
+    if weights.transposed { (weights.columns, weights.rows) } else { (weights.rows, weights.columns) }
 }
 
 /// Rows from which weights are read so often that they are made halves first.
@@ -206,7 +212,7 @@ impl Layer<'_> {
 
     /// The number of a term, clamped to the last, and whether it exists, if that is not certain.
     fn term(&self, e: &mut Emit, k: Value) -> (Value, Option<Value>) {
-        if self.terms.is_multiple_of(self.tile.k) {
+        if self.terms.is_multiple_of(self.tile.turn()) {
             return (k, None);
         }
         let (count, last) = (e.b.u(self.terms), e.b.u(self.terms - 1));
@@ -220,7 +226,7 @@ impl Layer<'_> {
         let column = e.b.add(first_column, at);
         // The matrix is `w.rows` lines of `w.columns` weights; a transposed one has a line a column of the layer.
         let (line, lines, first, ends) = if w.transposed {
-            (column, self.columns.end, k, (self.terms, self.terms.is_multiple_of(self.tile.k)))
+            (column, self.columns.end, k, (self.terms, self.terms.is_multiple_of(self.tile.turn())))
         } else {
             let whole = (self.columns.end - self.columns.start).is_multiple_of(self.tile.n);
             (k, self.terms, column, (self.columns.end, whole))

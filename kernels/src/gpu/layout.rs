@@ -228,9 +228,12 @@ impl<'a> Layout<'a> {
         })
     }
 
-    /// Starts a launch: scratch memory of the ones before it is free again.
+    /// Starts a launch. Scratch memory of earlier ones is used again after a while, not at once, or kernels that have nothing else
+    /// in common would wait for each other.
     pub fn next_launch(&mut self) {
-        self.scratch.iter_mut().for_each(|s| s.1 = 0);
+        const LANES: u64 = 1 << 24;
+        let most = LANES.min(self.max_lanes / 2);
+        self.scratch.iter_mut().filter(|s| s.1 > most).for_each(|s| s.1 = 0);
     }
 
     /// A buffer that lives during this launch.

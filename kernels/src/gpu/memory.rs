@@ -30,6 +30,8 @@ pub(super) struct Emit<'l, 'a> {
     limits: Limits,
     /// Whether float arenas are bound as vectors of four lanes.
     vectors: bool,
+    /// See [`Emit::in_order`].
+    in_order: bool,
 }
 
 impl<'l, 'a> Emit<'l, 'a> {
@@ -62,12 +64,20 @@ impl<'l, 'a> Emit<'l, 'a> {
             groups,
             limits,
             vectors: false,
+            in_order: false,
         })
     }
 
     /// Binds float arenas as vectors of four lanes if `vectors`, for kernels that mostly access four neighbours at once.
     pub fn with_vectors(mut self, vectors: bool) -> Emit<'l, 'a> {
         self.vectors = vectors;
+        self
+    }
+
+    /// Keeps reads on their side of barriers: drivers may put off those of buffers that nothing writes until they are needed, and
+    /// then wait for them. So all buffers are bound as if they were written.
+    pub fn in_order(mut self) -> Emit<'l, 'a> {
+        self.in_order = true;
         self
     }
 
@@ -104,6 +114,7 @@ impl<'l, 'a> Emit<'l, 'a> {
     }
 
     fn memory(&mut self, arena: ArenaId, write: bool) -> Memory {
+        let write = write || self.in_order;
         if arena == ArenaId::Workgroup {
             let Arena { name, lanes, .. } = self.layout.arena(arena);
             let (vectors, lanes) = (self.vectors, *lanes as u32);
@@ -352,10 +363,17 @@ impl Position {
 }
 
 /// Whether elements of a buffer with the given axes that neighbour in `rows` neighbour in memory, and a multiple of four of
-/// them begins at a multiple of four, if the number of rows is one.
+/// them begins at a multiple of four, if the number of rows is one: all rows, or the last axes of them.
 pub(super) fn is_run(axes: &Axes, rows: &Axes) -> bool {
-    let (all, rows): (Vec<&Axis>, Vec<&Axis>) = (axes.iter().collect(), rows.iter().collect());
-    !rows.is_empty() && all.ends_with(&rows)
+    let common = axes.iter().rev().zip(rows.iter().rev()).take_while(|(a, b)| a == b);
+    let (count, elements) = common.fold((0, 1), |(count, elements), (axis, _)| (count + 1, elements * axis.size()));
+    count > 0 && (count == rows.iter().count() || elements % 4 == 0)
+}
+
+/// Whether four rows from a multiple of four on are at the same element of a buffer with the given axes.
+pub(super) fn is_constant(axes: &Axes, rows: &Axes) -> bool {
+    let without: usize = rows.iter().rev().take_while(|a| !axes.contains(a)).map(Axis::size).product();
+    without.is_multiple_of(4)
 }
 
 /// Four neighbouring rows of so many, from `first` on, a multiple of four. Where they may lie behind the end, they are the last four

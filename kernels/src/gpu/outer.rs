@@ -21,6 +21,8 @@ const WHOLE: u32 = 128 * 256;
 const EACH_WHOLE: usize = 1;
 const EACH: usize = 2;
 const EACH_SMALL: usize = 4;
+/// Rows from which two stages are on their way.
+const LONG: usize = 1 << 14;
 /// Rows of a chunk, at least.
 const CHUNK_ROWS: usize = 64;
 /// Chunks, at most.
@@ -42,7 +44,8 @@ pub(super) fn kernels(
     let (rows, kept) = (over.elements(), keep.elements());
     let side = |buffer: BufferId, channels: usize| Side { buffer, channels: 0..channels };
     let (inputs, outputs) = (region.inst(*x).channels, region.inst(*d).channels);
-    let products = kept * rows.div_ceil(CHUNK_ROWS).min(MAX_CHUNKS);
+    let most_chunks = rows.div_ceil(CHUNK_ROWS).min(MAX_CHUNKS);
+    let products = kept * most_chunks;
     // Four neighbouring m are one vector, and so should neighbouring outputs be; but narrow tiles are narrow along n, and none
     // should be padded much.
     let time = |m, n| Tile::timed(&limits, (m, n, rows), products).1;
@@ -50,12 +53,16 @@ pub(super) fn kernels(
     let (x, d) = (side(*x_buffer, inputs), side(*d_buffer, outputs));
     let (m, n) = if swapped { (d, x) } else { (x, d) };
     let mut parts: Vec<Part> = vec![];
-    for n_channels in split(n.channels.len()) {
-        for m_channels in split(m.channels.len()) {
+    let sizes = (m.channels.len(), n.channels.len(), rows);
+    let terms = rows.div_ceil(most_chunks);
+    for n_channels in split(&limits, sizes, products, terms) {
+        for m_channels in split(&limits, (sizes.1, sizes.0, rows), products, terms) {
             let (m, n) = (m.part(m_channels), n.part(n_channels.clone()));
             let turned = m.channels.len() < 32;
             let (m, n) = if turned { (n, m) } else { (m, n) };
-            let tile = Tile::of(&limits, (m.channels.len(), n.channels.len(), rows), products);
+            let mut tile = Tile::of(&limits, (m.channels.len(), n.channels.len(), rows), products);
+            // Both operands come from far, and the sums are long.
+            tile.ahead = if tile.matrices.is_some() && rows >= LONG { 2 } else { 1 };
             parts.push(Part { m, n, swapped: swapped != turned, tile });
         }
     }
@@ -68,8 +75,8 @@ pub(super) fn kernels(
         _ => EACH_SMALL,
     };
     let enough = each * limits.workgroups as usize;
-    let wanted = enough.div_ceil(groups).min(rows.div_ceil(CHUNK_ROWS)).min(MAX_CHUNKS);
-    let depth = parts.iter().map(|p| p.tile.k).max().unwrap_or(1) as usize;
+    let wanted = enough.div_ceil(groups).min(most_chunks);
+    let depth = parts.iter().map(|p| p.tile.turn()).max().unwrap_or(1) as usize;
     let per_chunk = rows.div_ceil(wanted).next_multiple_of(depth);
     let chunks = rows.div_ceil(per_chunk);
     let lanes = inputs * outputs * kept;
@@ -138,6 +145,9 @@ impl Outer {
         let chunks = self.rows.div_ceil(self.per_chunk) as u32;
         let groups = chunks as u64 * kept as u64 * tiles_m as u64 * tiles_n as u64;
         let mut e = Emit::new(layout, limits, groups, tile.invocations())?.with_vectors(true);
+        if tile.ahead > 1 {
+            e = e.in_order();
+        }
         if e.spare_workgroups() {
             e.leave_from(e.workgroup, groups as u32);
         }
@@ -170,11 +180,11 @@ impl Outer {
             (from, to),
             Operand {
                 along: Along::K,
-                load: &mut |e, k, at| self.rows(e, (&part.m, tile.m, tile.k), keep, first_m, k, at, true),
+                load: &mut |e, k, at| self.rows(e, (&part.m, tile.m, tile.turn()), keep, first_m, k, at, true),
             },
             Operand {
                 along: Along::K,
-                load: &mut |e, k, at| self.rows(e, (&part.n, tile.n, tile.k), keep, first_n, k, at, false),
+                load: &mut |e, k, at| self.rows(e, (&part.n, tile.n, tile.turn()), keep, first_n, k, at, false),
             },
             &mut |e: &mut Emit, places: &[Place], sums: &[Value]| {
                 for (place, sums) in places.iter().zip(sums) {

@@ -55,7 +55,8 @@ impl Part {
 
 /// Kernels of a launch, in order.
 pub(super) fn lower(layout: &mut Layout, limits: Limits, launch: &Launch) -> Result<Vec<Kernel>, LowerError> {
-    let mut split = Split { layout, region: launch.region.clone(), sums: vec![], writers: vec![], late: vec![] };
+    let region = launch.region.clone();
+    let mut split = Split { layout, limits, region, sums: vec![], writers: vec![], late: vec![] };
     split.run()?;
     let Split { sums, writers, late, .. } = split;
     let mut parts: Vec<Part> = sums.into_iter().chain(writers).chain(late).collect();
@@ -105,6 +106,7 @@ fn part_name(part: &Part, i: usize) -> String {
 
 struct Split<'l, 'a> {
     layout: &'l mut Layout<'a>,
+    limits: Limits,
     region: Region,
     sums: Vec<Part>,
     writers: Vec<Part>,
@@ -225,7 +227,7 @@ impl Split<'_, '_> {
             && self.region.inst(*value).axes == self.region.domain
             && home.is_some_and(|linear| {
                 self.region.inst(linear).channels == self.region.inst(*value).channels
-                    && layer::has_totals(self.layout, &self.region, linear)
+                    && layer::has_totals(self.layout, &self.limits, &self.region, linear)
             })
     }
 

@@ -12,6 +12,7 @@ use super::half::Matrices;
 use super::layout::{Limits, SOFTWARE_TILES};
 use super::memory::Emit;
 use super::sums::Sums;
+use std::ops::Range;
 
 /// Invocations of a workgroup that every device can start.
 const MOST_INVOCATIONS: u32 = 256;
@@ -30,6 +31,8 @@ pub(super) struct Tile {
     pub own_m: u32,
     pub own_n: u32,
     pub matrices: Option<Matrices>,
+    /// Stages of `m` that are on their way from memory at a time.
+    pub ahead: u32,
     /// Whether an invocation has all `n`, and reads its `m` where they lie.
     pub direct: bool,
 }
@@ -80,7 +83,7 @@ impl Tile {
             _ if n <= 4 => 8,
             _ => 16,
         };
-        let tile = |m, n, k, own_m, own_n| Tile { m, n, k, own_m, own_n, matrices: None, direct: false };
+        let tile = |m, n, k, own_m, own_n| Tile { m, n, k, own_m, own_n, matrices: None, ahead: 1, direct: false };
         match n {
             0..=4 => vec![(tile(256, 4, deep, 4, 4), 1.0)],
             5..=8 => vec![(tile(128, 8, deep, 4, 4), 1.0)],
@@ -105,7 +108,7 @@ impl Tile {
     /// A tile of matrices, with the block of a subgroup in matrices.
     fn of_matrices(matrices: Matrices, m: u32, n: u32, own: (u32, u32)) -> Tile {
         let (own_m, own_n) = (own.0 * matrices.side, own.1 * matrices.side);
-        Tile { m, n, k: 32, own_m, own_n, matrices: Some(matrices), direct: false }
+        Tile { m, n, k: 32, own_m, own_n, matrices: Some(matrices), ahead: 1, direct: false }
     }
 
     /// Whether a device can start its workgroups.
@@ -129,7 +132,7 @@ impl Tile {
             _ => (256, 8),
         };
         let k = k.next_multiple_of(STEP as usize).min(32) as u32;
-        Tile { m, n, k, own_m, own_n: n, matrices: None, direct: true }
+        Tile { m, n, k, own_m, own_n: n, matrices: None, ahead: 1, direct: true }
     }
 
     /// Memory that a workgroup shares.
@@ -157,17 +160,33 @@ impl Tile {
         if self.matrices.is_some() { self.m / self.own_m } else { 1 }
     }
 
+    /// Terms that the loop over them takes at a time.
+    pub fn turn(&self) -> u32 {
+        self.k * self.ahead
+    }
+
     pub fn invocations(&self) -> u32 {
         (self.m / self.own_m) * (self.n / self.own_n) * self.matrices.map_or(1, |m| m.subgroup)
     }
 }
 
-/// Columns of a product of so many that are better computed by a kernel of their own: the few after the last whole tile.
-pub(super) fn split(columns: usize) -> Vec<std::ops::Range<usize>> {
+/// Columns of products, of sizes as for [`Tile::of`] and of so many terms each, that one kernel computes each: the few after the
+/// last whole tile get one of their own where that saves more than it takes to start.
+pub(super) fn split(
+    limits: &Limits,
+    (m, columns, k): (usize, usize, usize),
+    products: usize,
+    terms: usize,
+) -> Vec<Range<usize>> {
     const FEW: usize = 16;
+    /// Multiply-adds of a processor in the time of a kernel that has little to do.
+    const START: f64 = 1e6;
     let rest = columns % 64;
-    let few = columns > 64 && (1..=FEW).contains(&rest);
-    let end = if few { columns - rest } else { columns };
+    let end = columns - rest;
+    let time = |n| Tile::timed(limits, (m, n, k), products).1;
+    let start = START / terms as f64;
+    let apart = end > 0 && (1..=FEW).contains(&rest) && time(end) + time(rest) + start < time(columns);
+    let end = if apart { end } else { columns };
     [0..end, end..columns].into_iter().filter(|r| !r.is_empty()).collect()
 }
 
@@ -187,39 +206,68 @@ pub(super) struct Operand<'a> {
 }
 
 /// Emits the product over `from..to` of k, and gives all of the tile's sums to `epilogue`. Terms beyond `to` must come as zeros
-/// from `a`.
-pub(super) fn multiply(
+/// from `a`, up to a multiple of [`Tile::turn`].
+pub(super) fn multiply<'a>(
     e: &mut Emit,
     tile: Tile,
     (from, to): (Value, Value),
-    a: Operand,
-    b: Operand,
+    a: Operand<'a>,
+    b: Operand<'a>,
     epilogue: &mut dyn Epilogue,
 ) {
     if tile.direct {
         return direct::multiply(e, tile, (from, to), a, b, epilogue);
     }
-    let mut a = Staged::new(e, tile, "tile_a", tile.m, a);
-    let mut b = Staged::new(e, tile, "tile_b", tile.n, b);
+    let mut operands =
+        [Staged::new(e, tile, "tile_a", (tile.m, tile.ahead), a), Staged::new(e, tile, "tile_b", (tile.n, 1), b)];
     let sums = Sums::new(e, tile);
-    a.fetch(e, tile, from);
-    b.fetch(e, tile, from);
-    let k = e.b.open_loop("k", from, to, tile.k);
-    // The last stage is multiplied.
-    e.b.barrier();
-    a.put(e, tile);
-    b.put(e, tile);
-    e.b.barrier();
-    let depth = e.b.u(tile.k);
-    let next = e.b.add(k, depth);
-    let more = e.b.less(next, to);
-    e.b.open_if(more);
-    a.fetch(e, tile, next);
-    b.fetch(e, tile, next);
-    e.b.close_if();
-    sums.accumulate(e, tile, &a, &b);
+    let end = if tile.ahead > 1 { whole_turns(e, tile, from, to) } else { to };
+    for own in &mut operands {
+        own.fetch(e, tile, from, 0);
+        for number in 1..own.ahead() {
+            let at = plus(e, from, number * tile.k);
+            own.fetch_or(e, tile, at, number, (from, end));
+        }
+    }
+    let k = e.b.open_loop("k", from, to, tile.turn());
+    for number in 0..tile.ahead {
+        // The last stage is multiplied.
+        e.b.barrier();
+        operands.iter_mut().for_each(|own| own.put(e, tile, number));
+        e.b.barrier();
+        if tile.matrices.is_some() {
+            for own in &mut operands {
+                let at = plus(e, k, (number + own.ahead()) * tile.k);
+                own.fetch_or(e, tile, at, number, (from, end));
+            }
+        } else {
+            let next = plus(e, k, tile.k);
+            let more = e.b.less(next, to);
+            e.b.open_if(more);
+            operands.iter_mut().for_each(|own| own.fetch(e, tile, next, number));
+            e.b.close_if();
+        }
+        let [a, b] = &operands;
+        sums.accumulate(e, tile, a, b);
+    }
     e.b.close_loop();
     sums.give(e, tile, epilogue);
+}
+
+/// The first multiple of a turn after `from` that is not below `to`.
+fn whole_turns(e: &mut Emit, tile: Tile, from: Value, to: Value) -> Value {
+    let (turn, rest) = (e.b.u(tile.turn()), e.b.u(tile.turn() - 1));
+    let length = e.b.sub(to, from);
+    let length = e.b.add(length, rest);
+    let turns = e.b.div(length, turn);
+    let length = e.b.mul(turns, turn);
+    e.b.add(from, length)
+}
+
+/// `first + offset`
+pub(super) fn plus(e: &mut Emit, first: Value, offset: u32) -> Value {
+    let offset = e.b.u(offset);
+    e.b.add(first, offset)
 }
 
 /// An operand's way through workgroup memory.
@@ -231,12 +279,13 @@ pub(super) struct Staged<'a> {
     along: Along,
     /// Vectors of a line, padding included.
     line: u32,
-    /// What this invocation has fetched.
-    fetched: Vec<Var>,
+    /// What this invocation has fetched, of as many stages as are on their way.
+    fetched: Vec<Vec<Var>>,
 }
 
 impl<'a> Staged<'a> {
-    pub fn new(e: &mut Emit, tile: Tile, name: &str, edge: u32, operand: Operand<'a>) -> Staged<'a> {
+    /// With the length of the operand's edge, and the number of stages that are on their way at a time.
+    pub fn new(e: &mut Emit, tile: Tile, name: &str, (edge, ahead): (u32, u32), operand: Operand<'a>) -> Staged<'a> {
         let half = tile.matrices.is_some();
         // Padding keeps the lines of a tile in different banks.
         let padding = if half { 2 } else { 1 };
@@ -253,14 +302,17 @@ impl<'a> Staged<'a> {
             zeros = e.b.half(zeros);
         }
         let count = if !tile.direct { (tile.k * edge / 4).div_ceil(tile.invocations()) } else { 0 };
-        let fetched = (0..count).map(|i| e.b.var(&format!("{name}_next_n{i}_"), zeros)).collect();
+        let mut fetched = vec![];
+        for _ in 0..ahead {
+            fetched.push((0..count).map(|i| e.b.var(&format!("{name}_next_n{i}_"), zeros)).collect());
+        }
         Staged { operand, memory, edge, along, line, fetched }
     }
 
     /// Does something for each of the vectors that this invocation fetches: `act` is given k and the position in the tile.
     fn each(&mut self, e: &mut Emit, tile: Tile, mut act: impl FnMut(&mut Self, &mut Emit, usize, Value, Value)) {
         let (vectors, invocations) = (tile.k * self.edge / 4, tile.invocations());
-        for i in 0..self.fetched.len() {
+        for i in 0..self.fetched[0].len() {
             let done = i as u32 * invocations;
             let offset = e.b.u(done);
             let number = e.b.add(e.invocation, offset);
@@ -306,13 +358,28 @@ impl<'a> Staged<'a> {
         e.b.close_loop();
     }
 
-    /// From memory.
-    fn fetch(&mut self, e: &mut Emit, tile: Tile, first: Value) {
+    /// Stages that are on their way at a time.
+    fn ahead(&self) -> u32 {
+        self.fetched.len() as u32
+    }
+
+    /// The stage that begins at `at`, or one that will not be used where there is none: drivers rearrange what a branch has
+    /// loaded where the branch ends, and so wait for it before the product, which of matrices takes less time than the way from
+    /// memory.
+    fn fetch_or(&mut self, e: &mut Emit, tile: Tile, at: Value, number: u32, (other, end): (Value, Value)) {
+        let exists = e.b.less(at, end);
+        let at = e.b.select(exists, at, other);
+        self.fetch(e, tile, at, number);
+    }
+
+    /// From memory the stage that begins at `first`, as the one with a number.
+    fn fetch(&mut self, e: &mut Emit, tile: Tile, first: Value, number: u32) {
+        let which = (number % self.ahead()) as usize;
         self.each(e, tile, |own, e, i, k, at| {
             let k = e.b.add(first, k);
             let value = own.read(e, k, at);
             let value = if tile.matrices.is_some() { e.b.half(value) } else { value };
-            e.b.set(own.fetched[i], value);
+            e.b.set(own.fetched[which][i], value);
         });
     }
 
@@ -322,9 +389,10 @@ impl<'a> Staged<'a> {
     }
 
     /// Into workgroup memory.
-    fn put(&mut self, e: &mut Emit, tile: Tile) {
+    fn put(&mut self, e: &mut Emit, tile: Tile, number: u32) {
+        let which = (number % self.ahead()) as usize;
         self.each(e, tile, |own, e, i, k, at| {
-            let value = e.b.get(own.fetched[i]);
+            let value = e.b.get(own.fetched[which][i]);
             own.write(e, k, at, value);
         });
     }
