@@ -11,11 +11,13 @@ use raygrad_compiler::plan::region::BufferId;
 /// Chunks that are read before they are combined.
 const TOGETHER: u32 = 8;
 
-/// Lanes `first..first + lanes` of a buffer, as one stretch of a chunk's partial results.
+/// Lanes of a buffer from `first` on, as one stretch of a chunk's partial results.
 pub(super) struct End {
     pub buffer: BufferId,
     pub first: usize,
     pub lanes: usize,
+    /// If not all lie side by side: how many do, and how far from each other such lines begin.
+    pub lines: Option<(usize, usize)>,
     pub kind: Reduction,
 }
 
@@ -33,7 +35,10 @@ pub(super) fn finish(
     let mut merged: Vec<End> = vec![];
     for end in ends {
         match merged.last_mut() {
-            Some(m) if m.buffer == end.buffer && m.first + m.lanes == end.first && m.kind == end.kind => {
+            Some(m)
+                if (m.buffer, m.first + m.lanes, m.kind) == (end.buffer, end.first, end.kind)
+                    && (m.lines, end.lines) == (None, None) =>
+            {
                 m.lanes += end.lanes
             }
             _ => merged.push(End { ..*end }),
@@ -78,7 +83,13 @@ pub(super) fn finish(
         }
         let total = sum(&mut e, end.kind);
         let (before, first) = (e.b.u(from as u32), e.b.u(end.first as u32));
-        let at = e.b.sub(number, before);
+        let mut at = e.b.sub(number, before);
+        if let Some((lanes, apart)) = end.lines {
+            let (lanes, apart) = (e.b.u(lanes as u32), e.b.u(apart as u32));
+            let (line, lane) = (e.b.div(at, lanes), e.b.rem(at, lanes));
+            let before = e.b.mul(line, apart);
+            at = e.b.add(before, lane);
+        }
         let at = e.b.add(at, first);
         e.store(end.buffer, at, total);
         if !last {

@@ -6,7 +6,7 @@ use super::chunks::{End, finish};
 use super::give::Place;
 use super::layout::{Layout, Limits};
 use super::memory::{Emit, Position, is_run};
-use super::tile::{Along, Operand, Tile, multiply, split};
+use super::tile::{Along, Operand, Tile, multiply, plus, split};
 use super::{Kernel, LowerError};
 use naga::MathFunction as Math;
 use raygrad_compiler::graph::{Axes, Shape};
@@ -44,17 +44,17 @@ pub(super) fn kernels(
     let (rows, kept) = (over.elements(), keep.elements());
     let side = |buffer: BufferId, channels: usize| Side { buffer, channels: 0..channels };
     let (inputs, outputs) = (region.inst(*x).channels, region.inst(*d).channels);
-    let most_chunks = rows.div_ceil(CHUNK_ROWS).min(MAX_CHUNKS);
-    let products = kept * most_chunks;
+    let products = kept * most_chunks(rows);
     // Four neighbouring m are one vector, and so should neighbouring outputs be; but narrow tiles are narrow along n, and none
     // should be padded much.
     let time = |m, n| Tile::timed(&limits, (m, n, rows), products).1;
     let swapped = outputs > 32 && (inputs <= 32 || time(outputs, inputs) < 1.2 * time(inputs, outputs));
     let (x, d) = (side(*x_buffer, inputs), side(*d_buffer, outputs));
     let (m, n) = if swapped { (d, x) } else { (x, d) };
-    let mut parts: Vec<Part> = vec![];
+    let outer = Outer { outputs, rows, buffer: *buffer, keep, over };
     let sizes = (m.channels.len(), n.channels.len(), rows);
-    let terms = rows.div_ceil(most_chunks);
+    let terms = rows.div_ceil(most_chunks(rows));
+    let mut parts: Vec<Part> = vec![];
     for n_channels in split(&limits, sizes, products, terms) {
         for m_channels in split(&limits, (sizes.1, sizes.0, rows), products, terms) {
             let (m, n) = (m.part(m_channels), n.part(n_channels.clone()));
@@ -63,37 +63,14 @@ pub(super) fn kernels(
             let mut tile = Tile::of(&limits, (m.channels.len(), n.channels.len(), rows), products);
             // Both operands come from far, and the sums are long.
             tile.ahead = if tile.matrices.is_some() && rows >= LONG { 2 } else { 1 };
-            parts.push(Part { m, n, swapped: swapped != turned, tile });
+            parts.push(Part::new(&limits, &outer, m, n, swapped != turned, tile));
         }
     }
-    // All parts have the same chunks, so that one kernel sums them.
-    let groups: usize = parts.iter().map(|p| p.tiles() * kept).max().unwrap_or(1);
-    let any = |f: fn(&Tile) -> bool| parts.iter().any(|p| f(&p.tile));
-    let each = match () {
-        _ if any(|t| t.m * t.n >= WHOLE) => EACH_WHOLE,
-        _ if any(|t| t.invocations() > 64) => EACH,
-        _ => EACH_SMALL,
-    };
-    let enough = each * limits.workgroups as usize;
-    let wanted = enough.div_ceil(groups).min(most_chunks);
-    let depth = parts.iter().map(|p| p.tile.turn()).max().unwrap_or(1) as usize;
-    let per_chunk = rows.div_ceil(wanted).next_multiple_of(depth);
-    let chunks = rows.div_ceil(per_chunk);
-    let lanes = inputs * outputs * kept;
-    let to = match chunks {
-        1 => *buffer,
-        _ => layout.scratch("partial", Shape::of(Axes::none(), chunks * lanes, DType::F32))?,
-    };
     let several = parts.len() > 1;
-    let outer = Outer { inputs, outputs, rows, to, per_chunk, keep, over };
     let mut all = vec![];
     for (i, part) in parts.iter().enumerate() {
         let name = if several { format!("{name}.{}", i + 1) } else { name.to_string() };
-        all.push(outer.kernel(layout, limits, &name, part)?);
-    }
-    if chunks > 1 {
-        let end = End { buffer: *buffer, first: 0, lanes, kind: Reduction::Sum };
-        all.push(finish(layout, limits, &format!("{name}.finish"), to, chunks, &[end])?);
+        all.extend(outer.kernels(layout, limits, &name, part)?);
     }
     Ok(all)
 }
@@ -111,38 +88,104 @@ impl Side {
     }
 }
 
-/// What one kernel computes: some channels of either side.
+/// What one kernel computes: some channels of either side, in chunks of rows.
 struct Part {
     m: Side,
     n: Side,
     /// Whether m counts outputs, and n inputs.
     swapped: bool,
     tile: Tile,
+    /// Rows of a chunk.
+    per_chunk: usize,
+    chunks: usize,
 }
 
 impl Part {
-    fn tiles(&self) -> usize {
-        self.m.channels.len().div_ceil(self.tile.m as usize) * self.n.channels.len().div_ceil(self.tile.n as usize)
+    fn new(limits: &Limits, outer: &Outer, m: Side, n: Side, swapped: bool, tile: Tile) -> Part {
+        let tiles = m.channels.len().div_ceil(tile.m as usize) * n.channels.len().div_ceil(tile.n as usize);
+        let each = match () {
+            _ if tile.m * tile.n >= WHOLE => EACH_WHOLE,
+            _ if tile.invocations() > 64 => EACH,
+            _ => EACH_SMALL,
+        };
+        let enough = each * limits.workgroups as usize;
+        let wanted = enough.div_ceil(tiles * outer.keep.elements()).min(most_chunks(outer.rows));
+        let per_chunk = outer.rows.div_ceil(wanted).next_multiple_of(tile.turn() as usize);
+        Part { m, n, swapped, tile, per_chunk, chunks: outer.rows.div_ceil(per_chunk) }
+    }
+
+    fn inputs(&self) -> &Range<usize> {
+        if self.swapped { &self.n.channels } else { &self.m.channels }
+    }
+
+    fn outputs(&self) -> &Range<usize> {
+        if self.swapped { &self.m.channels } else { &self.n.channels }
     }
 }
 
+/// Chunks that so many rows are cut into, at most.
+fn most_chunks(rows: usize) -> usize {
+    rows.div_ceil(CHUNK_ROWS).min(MAX_CHUNKS)
+}
+
 struct Outer {
-    inputs: usize,
     outputs: usize,
     rows: usize,
-    to: BufferId,
-    per_chunk: usize,
+    buffer: BufferId,
     keep: Axes,
     over: Axes,
 }
 
+/// Where the products of some channels go: lane `(input outputs + output) kept` and so on of a chunk's block.
+struct Block {
+    buffer: BufferId,
+    /// The first channels, and outputs a line.
+    inputs: u32,
+    outputs: u32,
+    line: u32,
+    /// Lanes of a chunk.
+    lanes: u32,
+}
+
 impl Outer {
-    fn kernel(&self, layout: &Layout, limits: Limits, name: &str, part: &Part) -> Result<Kernel, LowerError> {
+    /// The kernel of a part, and the one that sums its chunks.
+    fn kernels(&self, layout: &mut Layout, limits: Limits, name: &str, part: &Part) -> Result<Vec<Kernel>, LowerError> {
+        let kept = self.keep.elements();
+        let (inputs, outputs) = (part.inputs(), part.outputs());
+        if part.chunks == 1 {
+            let line = self.outputs as u32;
+            let block = Block { buffer: self.buffer, inputs: 0, outputs: 0, line, lanes: 0 };
+            return Ok(vec![self.kernel(layout, limits, name, part, &block)?]);
+        }
+        let lanes = inputs.len() * outputs.len() * kept;
+        let block = Block {
+            buffer: layout.scratch("partial", Shape::of(Axes::none(), part.chunks * lanes, DType::F32))?,
+            inputs: inputs.start as u32,
+            outputs: outputs.start as u32,
+            line: outputs.len() as u32,
+            lanes: lanes as u32,
+        };
+        let first = self.kernel(layout, limits, name, part, &block)?;
+        let first_lane = (inputs.start * self.outputs + outputs.start) * kept;
+        let lines = Some((outputs.len() * kept, self.outputs * kept)).filter(|(own, all)| own < all);
+        let end = End { buffer: self.buffer, first: first_lane, lanes, lines, kind: Reduction::Sum };
+        let last = finish(layout, limits, &format!("{name}.finish"), block.buffer, part.chunks, &[end])?;
+        Ok(vec![first, last])
+    }
+
+    fn kernel(
+        &self,
+        layout: &Layout,
+        limits: Limits,
+        name: &str,
+        part: &Part,
+        block: &Block,
+    ) -> Result<Kernel, LowerError> {
         let tile = part.tile;
         let kept = self.keep.elements() as u32;
         let tiles_m = (part.m.channels.len() as u32).div_ceil(tile.m);
         let tiles_n = (part.n.channels.len() as u32).div_ceil(tile.n);
-        let chunks = self.rows.div_ceil(self.per_chunk) as u32;
+        let chunks = part.chunks as u32;
         let groups = chunks as u64 * kept as u64 * tiles_m as u64 * tiles_n as u64;
         let mut e = Emit::new(layout, limits, groups, tile.invocations())?.with_vectors(true);
         if tile.ahead > 1 {
@@ -168,11 +211,11 @@ impl Outer {
         let (first_m, first_n) = (first(&mut e, &part.m, tile_m, tile.m), first(&mut e, &part.n, tile_n, tile.n));
         e.b.name(first_m, "first_m");
         e.b.name(first_n, "first_n");
-        let (length, rows) = (e.b.u(self.per_chunk as u32), e.b.u(self.rows as u32));
+        let (length, rows) = (e.b.u(part.per_chunk as u32), e.b.u(self.rows as u32));
         let from = e.b.mul(chunk, length);
         let end = e.b.add(from, length);
         let to = e.b.math(Math::Min, &[end, rows]);
-        let lanes = e.b.u((self.inputs * self.outputs) as u32 * kept);
+        let lanes = e.b.u(block.lanes);
         let chunk_first = e.b.mul(chunk, lanes);
         multiply(
             &mut e,
@@ -191,7 +234,7 @@ impl Outer {
                     let (m, n) = (e.b.add(first_m, place.m), e.b.add(first_n, place.n));
                     let guarded = !part.n.channels.len().is_multiple_of(tile.n as usize);
                     let end = guarded.then_some(part.n.channels.end as u32);
-                    e.if_below(n, end, |e| self.write(e, part, (m, n), *sums, (keep, chunk_first)));
+                    e.if_below(n, end, |e| self.write(e, (part, block), (m, n), *sums, (keep, chunk_first)));
                 }
             },
         );
@@ -199,10 +242,18 @@ impl Outer {
     }
 
     /// Lane of the product of input and output channels in a chunk's block.
-    fn lane(&self, e: &mut Emit, part: &Part, (m, n): (Value, Value), (keep, chunk_first): (Value, Value)) -> Value {
+    fn lane(
+        &self,
+        e: &mut Emit,
+        (part, block): (&Part, &Block),
+        (m, n): (Value, Value),
+        (keep, chunk_first): (Value, Value),
+    ) -> Value {
         let (input, output) = if part.swapped { (n, m) } else { (m, n) };
-        let (outputs, kept) = (e.b.u(self.outputs as u32), e.b.u(self.keep.elements() as u32));
-        let channel = e.b.mul(input, outputs);
+        let (inputs, outputs) = (e.b.u(block.inputs), e.b.u(block.outputs));
+        let (input, output) = (e.b.sub(input, inputs), e.b.sub(output, outputs));
+        let (line, kept) = (e.b.u(block.line), e.b.u(self.keep.elements() as u32));
+        let channel = e.b.mul(input, line);
         let channel = e.b.add(channel, output);
         let at = e.b.mul(channel, kept);
         let at = e.b.add(at, keep);
@@ -210,25 +261,26 @@ impl Outer {
     }
 
     /// Writes four neighbouring m of one n.
-    fn write(&self, e: &mut Emit, part: &Part, (m, n): (Value, Value), sum: Value, block: (Value, Value)) {
+    fn write(&self, e: &mut Emit, at: (&Part, &Block), (m, n): (Value, Value), sum: Value, place: (Value, Value)) {
+        let (part, block) = at;
         let Range { start, end } = part.m.channels.clone();
         let whole = (end - start).is_multiple_of(part.tile.m as usize);
         let guard = (!whole).then_some(end as u32);
-        let fours = [start, end, self.outputs].iter().all(|x| x.is_multiple_of(4));
+        let ends = [start as u32, end as u32, block.outputs, block.line, block.lanes];
+        let fours = ends.iter().all(|x| x.is_multiple_of(4));
         if part.swapped && self.keep.elements() == 1 && fours {
             e.if_below(m, guard, |e| {
-                let at = self.lane(e, part, (m, n), block);
-                e.store_four(self.to, at, sum);
+                let lane = self.lane(e, at, (m, n), place);
+                e.store_four(block.buffer, lane, sum);
             });
             return;
         }
         for lane in 0..4 {
-            let offset = e.b.u(lane);
-            let m = e.b.add(m, offset);
+            let m = plus(e, m, lane);
             e.if_below(m, guard, |e| {
-                let at = self.lane(e, part, (m, n), block);
+                let to = self.lane(e, at, (m, n), place);
                 let value = e.b.component(sum, lane);
-                e.store(self.to, at, value);
+                e.store(block.buffer, to, value);
             });
         }
     }

@@ -140,7 +140,7 @@ fn group(
     let mut ends = vec![];
     for t in targets {
         let first = if by_lane { 0 } else { t.channel as usize * kept };
-        ends.push(End { buffer: region.stores[t.store].buffer(), first, lanes: results, kind: t.kind });
+        ends.push(End { buffer: region.stores[t.store].buffer(), first, lanes: results, lines: None, kind: t.kind });
     }
     let last = finish(layout, limits, &format!("{name}.finish"), partials, chunks, &ends)?;
     Ok(vec![first, last])

@@ -44,7 +44,7 @@ pub(super) fn kernels(
     }
     let partials = layout.scratch("partial", Shape::of(Axes::none(), chunks * lanes, DType::F32))?;
     let first = work.kernel(layout, limits, name, partials, per_chunk, chunks)?;
-    let end = End { buffer: *buffer, first: 0, lanes, kind: Reduction::Sum };
+    let end = End { buffer: *buffer, first: 0, lanes, lines: None, kind: Reduction::Sum };
     let last = finish(layout, limits, &format!("{name}.finish"), partials, chunks, &[end])?;
     Ok(vec![first, last])
 }
