@@ -4,7 +4,7 @@
 //!
 //! Every number is a median over rounds. PyTorch runs f32 with TF32 off, which is its default.
 
-use anyhow::Context;
+use anyhow::{Context, ensure};
 use clap::Parser;
 use raygrad_benches::{Programs, Table, median, number_before, output, quick};
 use serde::Deserialize;
@@ -114,12 +114,14 @@ fn main() -> anyhow::Result<()> {
         let mut own: BTreeMap<String, Vec<Bench>> = BTreeMap::new();
         let mut others: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
         for round in 1..=args.rounds {
-            for device in &args.devices {
+            for backend in &args.devices {
                 for precision in &args.precisions {
-                    let Some(bench) = args.own(work, device, precision)? else { continue };
-                    let name = format!("{device}, {precision}");
+                    let Some(bench) = args.own(work, backend, precision)? else { continue };
+                    let name = format!("{backend}, {precision}");
                     eprintln!("round {round}: {} on {name} {:.4} s", work.preset, bench.seconds_per_step);
+                    device.clone_from(&bench.device);
                     own.entry(name).or_default().push(bench);
+                    args.write(&device, &reported(&text, work, &own, &others)?)?;
                 }
             }
             let rows = own.values().flatten().last().map_or(0, |b| b.rows);
@@ -127,12 +129,12 @@ fn main() -> anyhow::Result<()> {
                 let seconds = args.peer(work, rows, options)?;
                 eprintln!("round {round}: {} in {name} {seconds:.4} s", work.preset);
                 others.entry(name).or_default().push(seconds);
+                args.write(&device, &reported(&text, work, &own, &others)?)?;
             }
         }
-        device = own.values().flatten().last().map(|b| b.device.clone()).context("no device was asked for")?;
-        report(&mut text, work, &own, &others)?;
-        args.write(&device, &text)?;
+        text = reported(&text, work, &own, &others)?;
     }
+    ensure!(!device.is_empty(), "no device was asked for");
     args.narrow(&mut text)?;
     let file = args.write(&device, &text)?;
     print!("{text}");
@@ -233,6 +235,18 @@ impl Args {
         command.args(["--device", "cuda", "--iters", "20"]).args(options);
         number_before(&output(command)?, "s/step")
     }
+}
+
+/// The text with what was measured of one step.
+fn reported(
+    text: &str,
+    work: &Work,
+    own: &BTreeMap<String, Vec<Bench>>,
+    others: &BTreeMap<&str, Vec<f64>>,
+) -> Result<String, std::fmt::Error> {
+    let mut text = text.to_string();
+    report(&mut text, work, own, others)?;
+    Ok(text)
 }
 
 fn report(

@@ -8,7 +8,7 @@ use raygrad_compiler::ops::registry;
 use raygrad_compiler::plan::{BufferKind, Program};
 use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Step, Target, compile};
-use raygrad_kernels::gpu::{Access, Half, Inputs, Kernel, Limits, Matrices, Storage, groups, lower, storages};
+use raygrad_kernels::gpu::{Access, ArenaId, Half, Inputs, Kernel, Limits, Matrices, Storage, groups, lower, storages};
 use raygrad_tests::MidGraph;
 use std::io::Write;
 use std::process::{Command, Stdio};
@@ -179,6 +179,27 @@ fn groups_keep_the_order_of_kernels_that_conflict() {
     }
     assert_eq!(groups.iter().map(Vec::len).sum::<usize>(), kernels.len());
     assert!(together, "a weight gradient and the gradient before it need not wait for each other");
+}
+
+/// Launches that use scratch memory need not wait for each other because of it, as the gradients of a layer's weights and of its
+/// inputs.
+#[test]
+fn launches_have_scratch_memory_of_their_own() {
+    let program = lower(&network(), &mut Inputs::default(), &Limits::default()).unwrap_or_else(|e| panic!("{e}"));
+    let is_scratch = |arena: ArenaId| match arena {
+        ArenaId::Own(i) => program.arenas[i].name.starts_with("scratch"),
+        ArenaId::Input(_) | ArenaId::Workgroup => false,
+    };
+    let launches = program.launches.iter().enumerate();
+    let launch_of: Vec<usize> = launches.flat_map(|(i, l)| l.kernels.iter().map(move |_| i)).collect();
+    let kernels: Vec<Kernel> = program.launches.iter().flat_map(|l| l.kernels.clone()).collect();
+    let writes = |k: &usize| kernels[*k].accesses.iter().any(|a| a.write && is_scratch(a.arena));
+    let together = groups(&kernels).into_iter().filter(|group| {
+        let mut launches: Vec<usize> = group.iter().filter(|k| writes(k)).map(|k| launch_of[*k]).collect();
+        launches.dedup();
+        launches.len() > 1
+    });
+    assert!(together.count() > 1, "kernels of every launch wait for those of the one before");
 }
 
 #[test]

@@ -72,9 +72,11 @@ fn layers_of_all_widths(device: &Device) {
     layer(device, 3, 100, 20, 40, true);
     layer(device, 1, 4096, 8, 8, false);
     layer(device, 5, 1, 64, 128, true);
-    // The largest tiles, and a column that they leave over.
+    // The largest tiles, and a column that they leave over: as one of many, and where rows are many, in a kernel of its own.
     layer(device, 2, 4100, 40, 257, false);
     layer(device, 1, 8205, 130, 40, false);
+    layer(device, 1, 40_000, 36, 65, false);
+    layer(device, 1, 40_004, 65, 36, false);
 }
 
 /// What a layer's kernel combines over all rows itself, of a value that it writes and of one that it does not.
@@ -90,9 +92,9 @@ fn layer_totals(rows: usize, inputs: usize, outputs: usize) -> Outputs {
 }
 
 fn totals_of_layers(device: &Device) {
-    // Narrow layers are summed by kernels of their own, and so are columns that a kernel of their own computes (130).
+    // Narrow layers are summed by kernels of their own, and so are columns that a kernel of their own computes (the last).
     for (rows, inputs, outputs) in
-        [(333, 34, 192), (1027, 20, 100), (4099, 70, 128), (5, 3, 66), (999, 30, 130), (50, 6, 3)]
+        [(333, 34, 192), (1027, 20, 100), (4099, 70, 128), (5, 3, 66), (999, 30, 130), (50, 6, 3), (6100, 300, 65)]
     {
         check(device, layer_totals(rows, inputs, outputs), 2e-5, &format!("totals of {rows}, {inputs} to {outputs}"));
     }
@@ -117,16 +119,21 @@ fn network_outputs(rows: usize, widths: [usize; 4]) -> Outputs {
 /// So many elements that an invocation takes four: channels by number and by index, values that broadcast, integers, and an
 /// update in place.
 fn elements_four_at_a_time(device: &Device) {
-    let (frame, row) = (Axis::new("frame", 3), Axis::new("row", 22000));
-    let x = Tensor::parameter("x", Shape::new(&[&frame, &row], 2));
-    let code = Tensor::parameter("code", Shape::new(&[&frame], 90));
-    let y = Tensor::data("y", Shape::new(&[&row], 1));
-    let wide = concat([&x, &code, &y]).sin();
-    let mask = x.less_than(&y);
-    let number = Tensor::index(&row).wrapping_add(&Tensor::index(&frame));
-    let outputs =
-        vec![("wide", wide), ("mask", mask.clone()), ("chosen", mask.select(&x, &(&x * &y))), ("number", number)];
-    check(device, outputs, 1e-5, "four elements at a time");
+    // Four neighbours are in one row of a frame, or not.
+    for (frames, rows) in [(4, 16_501), (3, 22_000)] {
+        let (frame, row) = (Axis::new("frame", frames), Axis::new("row", rows));
+        let x = Tensor::parameter("x", Shape::new(&[&frame, &row], 2));
+        let code = Tensor::parameter("code", Shape::new(&[&frame], 90));
+        let y = Tensor::data("y", Shape::new(&[&row], 1));
+        let wide = concat([&x, &code, &y]).sin();
+        let mask = x.less_than(&y);
+        let number = Tensor::index(&row).wrapping_add(&Tensor::index(&frame));
+        let outputs =
+            vec![("wide", wide), ("mask", mask.clone()), ("chosen", mask.select(&x, &(&x * &y))), ("number", number)];
+        check(device, outputs, 1e-5, &format!("{frames} by {rows}, four elements at a time"));
+    }
+    let (frame, row) = (Axis::new("frame", 3), Axis::new("row", 22_000));
+    let (x, y) = (Tensor::parameter("x", Shape::new(&[&frame, &row], 2)), Tensor::data("y", Shape::new(&[&row], 1)));
     let double = Step { outputs: vec![], updates: vec![(x.clone(), &x * 2.0 + &y)] };
     let mut session = Session::new(device.clone()).unwrap();
     let id = session.add(compile(&double, &device.target()).unwrap()).unwrap();

@@ -105,9 +105,6 @@ fn sum_of_linears(t: &Tensor) -> Option<Tensor> {
     let pick = summed.op_as::<Pick>().filter(|_| summed.inputs().len() == 1);
     let added = if pick.is_some() { &summed.inputs()[0] } else { summed };
     let products = terms(added)?;
-    if products.iter().any(|p| p.inputs()[1].axes().iter().any(|a| over.contains(a))) {
-        return None;
-    }
     let each = products.into_iter().map(|product| {
         let part = match pick {
             Some(_) => Tensor::record_arc(summed.op().clone(), vec![product]),
