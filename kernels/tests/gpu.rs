@@ -181,6 +181,25 @@ fn groups_keep_the_order_of_kernels_that_conflict() {
     assert!(together, "a weight gradient and the gradient before it need not wait for each other");
 }
 
+/// The column that 257 have beyond the largest tiles gets a kernel of its own where rows are many, and none where a kernel takes
+/// longer to start than to compute it.
+#[test]
+fn few_columns_are_computed_apart_where_that_pays() {
+    let count = |rows: usize| {
+        let row = Axis::new("row", rows);
+        let data = |name: &str, channels: usize| Tensor::data(name, Shape::new(&[&row], channels));
+        let w = Tensor::parameter("w", Shape::new(&[], (256, 257)));
+        let outputs = vec![
+            ("y".into(), data("x", 256).linear(&w)),
+            ("dw".into(), data("x", 256).outer(&data("d", 257), &Axes::none())),
+        ];
+        let program = compile(&Step { outputs, updates: vec![] }, &Target::gpu()).unwrap_or_else(|e| panic!("{e}"));
+        let kernels = lowered(&program, &Limits::default(), "257 columns");
+        kernels.iter().filter(|k| !k.name.ends_with("finish")).count()
+    };
+    assert_eq!([count(1000), count(100_000)], [2, 4]);
+}
+
 /// Launches that use scratch memory need not wait for each other because of it, as the gradients of a layer's weights and of its
 /// inputs.
 #[test]
