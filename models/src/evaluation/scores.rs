@@ -21,6 +21,8 @@ pub enum Metric {
     DepthError,
     /// In the plane: mean distance between estimated and true corners of the patches.
     CornerErrorPx,
+    /// In the plane: mean distance of estimated and true warps as vectors of sl(3).
+    WarpError,
     /// In the plane: PSNR of all patches together.
     PatchPsnrDb,
     /// In the plane: 1 where the corner error is below [`success_px`], else 0; over several runs, their share.
@@ -36,7 +38,7 @@ pub fn success_px(height: usize, width: usize) -> f64 {
 }
 
 impl Metric {
-    pub const ALL: [Metric; 13] = [
+    pub const ALL: [Metric; 14] = [
         Metric::RotationErrorDeg,
         Metric::TranslationErrorX100,
         Metric::PsnrDb,
@@ -47,6 +49,7 @@ impl Metric {
         Metric::MaskedLpips,
         Metric::DepthError,
         Metric::CornerErrorPx,
+        Metric::WarpError,
         Metric::PatchPsnrDb,
         Metric::Success,
         Metric::Chamfer,
@@ -65,6 +68,7 @@ impl Metric {
             Metric::MaskedLpips => "masked_lpips",
             Metric::DepthError => "depth_error",
             Metric::CornerErrorPx => "corner_error_px",
+            Metric::WarpError => "warp_error",
             Metric::PatchPsnrDb => "patch_psnr_db",
             Metric::Success => "success",
             Metric::Chamfer => "chamfer",
@@ -84,6 +88,7 @@ impl Metric {
             Metric::MaskedLpips => "masked LPIPS",
             Metric::DepthError => "depth error",
             Metric::CornerErrorPx => "corner error (px)",
+            Metric::WarpError => "warp error (sl3)",
             Metric::PatchPsnrDb => "patch PSNR (dB)",
             Metric::Success => "success (share)",
             Metric::Chamfer => "Chamfer distance",
@@ -94,6 +99,7 @@ impl Metric {
     pub fn decimals(self) -> usize {
         match self {
             Metric::PsnrDb | Metric::MaskedPsnrDb | Metric::PatchPsnrDb | Metric::Success => 2,
+            Metric::WarpError => 4,
             _ => 3,
         }
     }
@@ -137,6 +143,8 @@ pub struct Scores {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub corner_error_px: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
+    pub warp_error: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
     pub patch_psnr_db: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub success: Option<f64>,
@@ -157,6 +165,7 @@ impl Scores {
             Metric::MaskedLpips => self.masked_lpips,
             Metric::DepthError => self.depth_error,
             Metric::CornerErrorPx => self.corner_error_px,
+            Metric::WarpError => self.warp_error,
             Metric::PatchPsnrDb => self.patch_psnr_db,
             Metric::Success => self.success,
             Metric::Chamfer => self.chamfer,
@@ -180,6 +189,7 @@ impl Scores {
             masked_lpips: of(Metric::MaskedLpips),
             depth_error: of(Metric::DepthError),
             corner_error_px: of(Metric::CornerErrorPx),
+            warp_error: of(Metric::WarpError),
             patch_psnr_db: of(Metric::PatchPsnrDb),
             success: of(Metric::Success),
             chamfer: of(Metric::Chamfer),
@@ -296,11 +306,11 @@ mod tests {
         let all: Scores = serde_json::from_str(
             r#"{"rotation_error_deg": 1, "translation_error_x100": 2, "psnr_db": 3,
                 "ssim": 4, "lpips": 5, "masked_psnr_db": 6, "masked_ssim": 7, "masked_lpips": 8, "depth_error": 9,
-                "corner_error_px": 10, "patch_psnr_db": 11, "success": 12, "chamfer": 13}"#,
+                "corner_error_px": 10, "warp_error": 11, "patch_psnr_db": 12, "success": 13, "chamfer": 14}"#,
         )
         .unwrap();
         let values: Vec<f64> = Metric::ALL.iter().filter_map(|m| all.get(*m)).collect();
-        assert_eq!(values, (1..=13).map(f64::from).collect::<Vec<_>>());
+        assert_eq!(values, (1..=14).map(f64::from).collect::<Vec<_>>());
         let json = serde_json::to_value(all).unwrap();
         assert!(Metric::ALL.iter().all(|m| json.get(m.key()).is_some()));
     }

@@ -254,8 +254,8 @@ mod tests {
         assert!(csv.starts_with("metric,stage,method,source,verified,fern,a_b,mean\n"), "{csv}");
         assert!(csv.contains("rotation_error_deg,,barf,\"P, T\",false,0.125,,0.125\n"), "{csv}");
         let views = table().views_csv();
-        assert!(views.contains("fern,l2g,cameras,\"cam, 1\",0.25,,,,,,,,,,,,\n"), "{views}");
-        assert!(views.contains("fern,l2g,before,mean,,,21,,,,,,,,,,\n"), "{views}");
+        assert!(views.contains("fern,l2g,cameras,\"cam, 1\",0.25,,,,,,,,,,,,,\n"), "{views}");
+        assert!(views.contains("fern,l2g,before,mean,,,21,,,,,,,,,,,\n"), "{views}");
         let latex = table().to_latex();
         assert!(latex.contains("a\\_b") && latex.contains("\\textbf{0.125}"), "{latex}");
         assert!(latex.starts_with("\\begin{tabular}{llrrr}\n") && latex.contains("\\end{tabular}"), "{latex}");

@@ -8,7 +8,7 @@ use crate::estimate::{Trial, timed};
 use crate::evaluation;
 use crate::geometry::Transform;
 use crate::pictures::View;
-use crate::run::metrics::{CornerError, Entry, Final, Measured, Metrics};
+use crate::run::metrics::{Entry, Final, Measured, Metrics, OfPatches};
 use crate::run::{RunFolder, results};
 use crate::training::learner::psnr;
 use crate::training::{Learner, Training, Watch};
@@ -95,7 +95,10 @@ impl Trainer {
             warps.iter().zip(&self.data.truth).map(|(w, t)| self.data.grid.corner_error(w, t)).collect();
         self.learner.check_finite("corner error", &per_patch)?;
         let patch_psnr_db = psnr(loss.get("render").copied().unwrap_or(1.0));
-        let measured = Measured::Planar { patch_psnr_db, corner_error_px: CornerError::new(per_patch) };
+        let distances = warps.iter().zip(&self.data.truth).map(|(w, t)| w.sl3_distance(t));
+        let warp_error = distances.collect::<Option<Vec<f64>>>().map(OfPatches::new);
+        let corner_error_px = OfPatches::new(per_patch);
+        let measured = Measured::Planar { patch_psnr_db, corner_error_px, warp_error };
         let relocalised = vec![];
         Ok((Entry { step: self.learner.steps_done(), loss, measured, relocalised }, warps))
     }
@@ -173,7 +176,9 @@ impl Training for Trainer {
         Ok(Trial { frame, evaluation })
     }
     fn summary(&self, last: &Final) -> String {
-        let Measured::Planar { patch_psnr_db, corner_error_px } = &last.entry.measured else { return String::new() };
+        let Measured::Planar { patch_psnr_db, corner_error_px, .. } = &last.entry.measured else {
+            return String::new();
+        };
         let errors: Vec<String> = corner_error_px.per_patch.iter().map(|e| format!("{e:.2}")).collect();
         let drawn = if self.settings.data.points_per_patch == Count::All { "" } else { ", measured on all pixels" };
         let (mean, steps, time) = (corner_error_px.mean, last.entry.step, crate::report::duration(last.seconds));

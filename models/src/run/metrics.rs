@@ -34,7 +34,10 @@ pub enum Measured {
         /// -10 log10 of the rendering loss of this step.
         patch_psnr_db: f64,
         /// Distance in pixels between estimated and true patch corners.
-        corner_error_px: CornerError,
+        corner_error_px: OfPatches,
+        /// Distance of estimated and true warps as vectors of sl(3); none where one is no exponential.
+        #[serde(default, skip_serializing_if = "Option::is_none")]
+        warp_error: Option<OfPatches>,
     },
     Space {
         /// -10 log10 of the rendering loss of this step.
@@ -66,9 +69,16 @@ impl Entry {
         }
     }
     /// Corner errors of a planar run.
-    pub fn corners(&self) -> Option<&CornerError> {
+    pub fn corners(&self) -> Option<&OfPatches> {
         match &self.measured {
             Measured::Planar { corner_error_px, .. } => Some(corner_error_px),
+            Measured::Space { .. } => None,
+        }
+    }
+    /// Distances of a planar run's warps in sl(3).
+    pub fn warp_error(&self) -> Option<&OfPatches> {
+        match &self.measured {
+            Measured::Planar { warp_error, .. } => warp_error.as_ref(),
             Measured::Space { .. } => None,
         }
     }
@@ -85,15 +95,15 @@ impl Entry {
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct CornerError {
+pub struct OfPatches {
     pub mean: f64,
     pub per_patch: Vec<f64>,
 }
 
-impl CornerError {
-    pub fn new(per_patch: Vec<f64>) -> CornerError {
+impl OfPatches {
+    pub fn new(per_patch: Vec<f64>) -> OfPatches {
         let mean = per_patch.iter().sum::<f64>() / per_patch.len().max(1) as f64;
-        CornerError { mean, per_patch }
+        OfPatches { mean, per_patch }
     }
 }
 

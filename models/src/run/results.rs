@@ -40,8 +40,10 @@ pub fn write_evaluation(
     found: &Evaluation,
 ) -> Result<evaluation::Evaluation, Error> {
     let corners: &[f64] = found.entry.corners().map_or(&[], |c| &c.per_patch);
+    let warps = found.entry.warp_error();
     let patch = |(i, error): (usize, &f64)| {
-        let scores = Scores { corner_error_px: Some(*error), ..Scores::default() };
+        let warp_error = warps.and_then(|w| w.per_patch.get(i).copied());
+        let scores = Scores { corner_error_px: Some(*error), warp_error, ..Scores::default() };
         ViewScores { view: format!("patch {i}"), scores }
     };
     let mut cameras = Measured::new(corners.iter().enumerate().map(patch).collect());

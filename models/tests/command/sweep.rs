@@ -37,7 +37,7 @@ fn a_sweep_trains_all_and_goes_on_where_it_was_stopped() {
     let w = Workplace::new();
     let file = write_sweep(&w);
     let text = w.succeed(&["sweep", &file, "--out", "whole"]);
-    mentions(&text, &["corner error (px)  tiny", "slow", "±", "success", "whole/sweep.csv"]);
+    mentions(&text, &["corner error (px)  tiny", "slow", "±", "warp error", "success", "whole/sweep.csv"]);
     let mut found = names(&w.path("whole"));
     found.sort();
     let cells = ["builtin-slow-s0", "builtin-slow-s1", "builtin-tiny-s0", "builtin-tiny-s1"];
@@ -47,7 +47,7 @@ fn a_sweep_trains_all_and_goes_on_where_it_was_stopped() {
     let corner = |i: usize| runs[i]["evaluation"]["cameras"]["mean"]["corner_error_px"].as_f64().unwrap();
     let csv = |sweep: &str| std::fs::read_to_string(w.path(sweep).join("sweep.csv")).unwrap();
     let mean = (corner(0) + corner(1)) / 2.0;
-    mentions(&csv("whole"), &[&format!("corner_error_px,,tiny,ours,true,{mean},")]);
+    mentions(&csv("whole"), &[&format!("corner_error_px,,tiny,ours,true,{mean},"), "warp_error,,tiny,ours,true,0."]);
 
     // One run stopped half-way, one before its first checkpoint, the others not begun.
     let sweep = Sweep::load(&w.path("grid.toml")).unwrap();
