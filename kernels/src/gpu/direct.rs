@@ -5,15 +5,16 @@
 use super::builder::{Kind, Memory, Value};
 use super::give::{Epilogue, Place, place, through_columns};
 use super::memory::Emit;
+use super::product::{Along, Operand, Staged, plus};
 use super::reduce::{combine, neutral};
-use super::tile::{Along, Operand, Staged, Tile, plus};
+use super::tile::Tile;
 use naga::{BuiltIn, MathFunction};
 use raygrad_compiler::ops::Reduction;
 
 /// Terms that are added to a sum between reading and writing it: those that operands give as a vector.
 pub(super) const STEP: u32 = 4;
 
-/// The product as of [`super::tile::multiply`].
+/// The product as of [`super::product::multiply`].
 pub(super) fn multiply(
     e: &mut Emit,
     tile: Tile,

@@ -6,7 +6,8 @@
 
 use super::builder::{Memory, Value};
 use super::channels::{Linear, Run, affine, is_indexable, runs_of, sequence};
-use super::memory::{Emit, Position, is_constant, is_run, kind};
+use super::memory::{Emit, kind};
+use super::position::{Position, is_constant, is_run};
 use super::scalar::larger;
 use super::{eigen, scalar};
 use naga::BinaryOperator as Op;

@@ -3,9 +3,11 @@
 use super::builder::Value;
 use super::epilogue::{Finish, First, RowTotal, loads, totals};
 use super::layout::{Layout, Limits};
-use super::memory::{Emit, Position, four_rows, is_run};
+use super::memory::Emit;
 use super::parts::{empty, push_load};
-use super::tile::{Along, Operand, Tile, multiply, split};
+use super::position::{Position, four_rows, is_run};
+use super::product::{Along, Operand, multiply};
+use super::tile::{Tile, split};
 use super::{Kernel, LowerError, elements};
 use naga::MathFunction as Math;
 use raygrad_compiler::graph::Axes;

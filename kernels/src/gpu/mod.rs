@@ -30,6 +30,8 @@ mod outer;
 mod parts;
 mod peak;
 mod phases;
+mod position;
+mod product;
 mod reduce;
 mod resident;
 mod resident_layer;

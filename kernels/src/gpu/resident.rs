@@ -9,8 +9,9 @@
 use super::builder::{Kind, Value};
 use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
-use super::memory::{Emit, Position, four_rows, is_run};
+use super::memory::Emit;
 use super::phases::{Phase, Phases};
+use super::position::{Position, four_rows, is_run};
 use super::resident_layer;
 use super::resident_line::Carried;
 use super::room::tile_of;

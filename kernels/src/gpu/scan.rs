@@ -9,7 +9,8 @@
 use super::builder::{Kind, Memory, Value, Var};
 use super::eval::{Channel, Values};
 use super::layout::{Layout, Limits};
-use super::memory::{Emit, Position, WORKGROUP};
+use super::memory::{Emit, WORKGROUP};
+use super::position::Position;
 use super::reduce::{combine, neutral};
 use super::{Kernel, LowerError};
 use raygrad_compiler::graph::{Axes, Axis, Shape};

@@ -4,7 +4,8 @@ use super::builder::{Factor, MatrixSum, Value, Var};
 use super::give::{Epilogue, Strips, give_blocks};
 use super::half::Matrices;
 use super::memory::Emit;
-use super::tile::{Staged, Tile};
+use super::product::Staged;
+use super::tile::Tile;
 use naga::BuiltIn;
 
 /// What is accumulated.
