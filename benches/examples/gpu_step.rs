@@ -124,6 +124,7 @@ fn main() -> anyhow::Result<()> {
                     args.write(&device, &reported(&text, work, &own, &others)?)?;
                 }
             }
+            ensure!(!device.is_empty(), "no device was asked for");
             let rows = own.values().flatten().last().map_or(0, |b| b.rows);
             for (name, options) in peers {
                 let seconds = args.peer(work, rows, options)?;
@@ -134,7 +135,6 @@ fn main() -> anyhow::Result<()> {
         }
         text = reported(&text, work, &own, &others)?;
     }
-    ensure!(!device.is_empty(), "no device was asked for");
     args.narrow(&mut text)?;
     let file = args.write(&device, &text)?;
     print!("{text}");

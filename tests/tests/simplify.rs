@@ -64,6 +64,21 @@ fn gradients_of_codes_are_summed_before_layers() {
     assert_eq!(wide.len(), 1, "{wide:?}");
 }
 
+/// A layer of one channel is added to all channels of another, and has no second one to choose.
+#[test]
+fn layers_that_are_added_to_wider_ones_stay() {
+    let (row, x) = (Axis::new("row", 3), |name: &str, row: &Axis| Tensor::data(name, Shape::new(&[row], 2)));
+    let w = |name: &str, columns: usize| Tensor::data(name, Shape::new(&[], (2, columns)));
+    let added = x("x", &row).linear(&w("wide", 3)) + x("x", &row).linear(&w("narrow", 1));
+    let step = Step { outputs: vec![("sum".into(), added.slice(1..3).sum(&[&row]))], updates: vec![] };
+    let array = |shape: Shape| Array::floats(&shape, (1..=shape.lanes()).map(|i| i as f64).collect());
+    let shapes =
+        [("x", Shape::new(&[&row], 2)), ("wide", Shape::new(&[], (2, 3))), ("narrow", Shape::new(&[], (2, 1)))];
+    let bindings: Bindings = shapes.into_iter().map(|(name, shape)| (name.to_string(), array(shape))).collect();
+    let simple = simplify(&step);
+    assert_eq!(reference(&simple, &bindings), reference(&step, &bindings));
+}
+
 /// Two functions may each make an axis of the same name for a sum of their own.
 #[test]
 fn axes_of_one_name_stay_apart() {

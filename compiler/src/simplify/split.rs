@@ -115,7 +115,7 @@ fn sum_of_linears(t: &Tensor) -> Option<Tensor> {
     each.reduce(|a, b| a + b)
 }
 
-/// The layers of as many axes whose sum this is, if it is one.
+/// The layers of as many axes and channels whose sum this is, if it is one.
 fn terms(t: &Tensor) -> Option<Vec<Tensor>> {
     if !is_map::<Add>(t) {
         return None;
@@ -123,7 +123,7 @@ fn terms(t: &Tensor) -> Option<Vec<Tensor>> {
     let mut all = vec![];
     for x in t.inputs() {
         match x.op().form() {
-            _ if x.axes() != t.axes() => return None,
+            _ if (x.axes(), x.width()) != (t.axes(), t.width()) => return None,
             Form::Linear { .. } if x.inputs()[0].axes() == t.axes() => all.push(x.clone()),
             _ => all.extend(terms(x)?),
         }

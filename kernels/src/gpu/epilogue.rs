@@ -213,23 +213,22 @@ impl Layer<'_> {
         let end = e.b.u(self.rows);
         let nothing = neutral(&mut e.b, kind);
         let certain = self.rows.is_multiple_of(self.tile.m);
+        let (together, apart) = (!certain && self.in_fours(), !certain && !self.in_fours());
         let counted = |e: &mut Emit, row: Value, value: Value| {
             let inside = e.b.less(row, end);
             e.b.select(inside, value, nothing)
         };
         let mut all = vec![];
         for lane in 0..4 {
-            let own = if value.vector { e.b.component(value, lane) } else { value };
-            all.push(match certain || self.in_fours() {
-                true => own,
-                false => {
-                    let row = plus(e, row, lane);
-                    counted(e, row, own)
-                }
-            });
+            let mut own = if value.vector { e.b.component(value, lane) } else { value };
+            if apart {
+                let row = plus(e, row, lane);
+                own = counted(e, row, own);
+            }
+            all.push(own);
         }
         let all = combine_all(&mut e.b, kind, &all);
-        if certain || !self.in_fours() { all } else { counted(e, row, all) }
+        if together { counted(e, row, all) } else { all }
     }
 
     /// Writes the region's values of one column at four rows.

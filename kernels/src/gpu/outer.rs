@@ -57,9 +57,10 @@ pub(super) fn kernels(
     let sizes = (m.channels.len(), n.channels.len(), rows);
     let terms = rows.div_ceil(most_chunks(rows));
     let mut parts: Vec<Part> = vec![];
+    let m_parts = split(&limits, (sizes.1, sizes.0, rows), products, terms);
     for n_channels in split(&limits, sizes, products, terms) {
-        for m_channels in split(&limits, (sizes.1, sizes.0, rows), products, terms) {
-            let (m, n) = (m.part(m_channels), n.part(n_channels.clone()));
+        for m_channels in &m_parts {
+            let (m, n) = (m.part(m_channels.clone()), n.part(n_channels.clone()));
             let turned = m.channels.len() < 32;
             let (m, n) = if turned { (n, m) } else { (m, n) };
             let mut tile = Tile::of(&limits, (m.channels.len(), n.channels.len(), rows), products);
@@ -138,12 +139,13 @@ struct Outer {
     over: Axes,
 }
 
-/// Where the products of some channels go: lane `(input outputs + output) kept` and so on of a chunk's block.
+/// Where the products of some channels go: to lane `((input - inputs) line + output - outputs) kept + keep` of a chunk's block.
 struct Block {
     buffer: BufferId,
-    /// The first channels, and outputs a line.
+    /// The first channels.
     inputs: u32,
     outputs: u32,
+    /// Outputs from an input to the next.
     line: u32,
     /// Lanes of a chunk.
     lanes: u32,
