@@ -17,17 +17,17 @@ const TRIAL: f64 = 1.0;
 /// What a run should take, in seconds.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Estimate {
-    /// The steps that are left, with the frames of the animation.
+    /// The steps that are left, with the frames of the animation and whatever else is done between steps.
     pub training: f64,
-    /// Measuring the model after the last step, without what the host computes of pictures.
+    /// Measuring the model after the last step.
     pub evaluation: f64,
 }
 
-/// What parts of an evaluation take, in seconds.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// What the parts of a run beside its steps take, in seconds.
+#[derive(Clone, Debug, PartialEq)]
 pub struct Trial {
-    /// A frame of the animation.
-    pub frame: f64,
+    /// What is done every so many steps (never where that is 0), and what it takes once.
+    pub recurring: Vec<(usize, f64)>,
     /// All of the evaluation.
     pub evaluation: f64,
 }
@@ -44,11 +44,9 @@ impl Estimate {
         let one = seconds_per_step(trainer)?;
         let trial = trainer.trial()?;
         trainer.restore(&begun)?;
-        let frames = match settings.run.picture_every {
-            0 => 0,
-            every => steps / every - step / every,
-        };
-        let training = one * left as f64 + trial.frame * frames as f64;
+        let times = |every: usize| if every == 0 { 0 } else { steps / every - step / every };
+        let recurring = trial.recurring.iter().map(|(every, once)| times(*every) as f64 * once);
+        let training = one * left as f64 + recurring.sum::<f64>();
         Ok(Some(Estimate { training, evaluation: trial.evaluation }))
     }
 

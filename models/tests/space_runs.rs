@@ -2,7 +2,7 @@
 
 use raygrad::run::{Entry, RunFolder};
 use raygrad::training::{Training, Watch};
-use raygrad::{Error, Experiment, Observer, Quiet};
+use raygrad::{Error, Experiment, Observer, Quiet, Trial};
 use serde_json::Value;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -95,14 +95,21 @@ fn searches_that_find_no_lost_camera_leave_a_run_as_it_is() {
 }
 
 #[test]
-fn the_time_of_an_evaluation_counts_views_and_refinement() {
+fn a_trial_counts_views_refinement_and_all_that_recurs() {
     let dir = tempfile::tempdir().unwrap();
     let trial = |set: &[&str]| tiny(set, &dir.path().join("run")).explorer().unwrap().trial().unwrap();
-    let known = trial(&["warp.method=none", "scene.poses=truth"]);
-    assert!(known.frame > 0.0 && known.evaluation == 2.0 * known.frame, "{known:?}");
-    // Two views, before and after the refinement of their poses.
-    let found = trial(&[]);
-    assert!(found.evaluation > 4.0 * found.frame, "{found:?}");
+    let every = |trial: &Trial| trial.recurring.iter().map(|(every, _)| *every).collect::<Vec<_>>();
+    let known = trial(&["warp.method=none", "scene.poses=truth", "train.relocalise_every=20", "run.picture_every=30"]);
+    assert_eq!(every(&known), [30, 0], "known poses are not lost");
+    // Two views, each a frame and its scores.
+    let frame = known.recurring[0].1;
+    assert!(frame > 0.0 && known.evaluation > 2.0 * frame, "{known:?}");
+    let sets = ["train.relocalise_every=20", "train.validate_every=50", "run.picture_every=30"];
+    let found = trial(&[&sets[..], &["run.log_every=50", "scene.val_views=1"]].concat());
+    assert_eq!(every(&found), [20, 30, 50]);
+    assert!(found.recurring.iter().all(|(_, seconds)| *seconds > 0.0), "{found:?}");
+    // Before and after the refinement of their poses.
+    assert!(found.evaluation > 4.0 * found.recurring[1].1, "{found:?}");
 }
 
 #[test]

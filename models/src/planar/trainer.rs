@@ -173,7 +173,7 @@ impl Training for Trainer {
             self.evaluate()?;
             self.picture(true).map(drop)
         })?;
-        Ok(Trial { frame, evaluation })
+        Ok(Trial { recurring: vec![(self.settings.run.picture_every, frame)], evaluation })
     }
     fn summary(&self, last: &Final) -> String {
         let Measured::Planar { patch_psnr_db, corner_error_px, .. } = &last.entry.measured else {

@@ -2,7 +2,7 @@
 //! the test views, at the poses that the alignment gives and after test-time refinement.
 
 use super::data::{SpaceData, SpaceDataError};
-use super::explorer::{Explorer, Rendered};
+use super::explorer::{Explorer, Rendered, relocalise_every, validate_every};
 use crate::Error;
 use crate::config::{Method, Settings};
 use crate::estimate::{Trial, timed};
@@ -92,11 +92,19 @@ pub fn validate(explorer: &mut Explorer) -> Result<Option<f64>, Error> {
     Ok(Some(psnr(&Picture::new(width, height, &seen.rgb)?, &Picture::new(width, height, &photo)?)?))
 }
 
-/// Times a part of a view, and a step of the refinement of a pose, for all that there are.
+/// Times a part of a view, a step of the refinement of a pose, the scores of a view and a look for a lost camera, for all that
+/// there are.
 pub fn trial(explorer: &mut Explorer) -> Result<Trial, Error> {
-    let data = explorer.data.clone();
+    let (data, lpips) = (explorer.data.clone(), explorer.lpips.clone());
+    let (search_every, mut recurring) = (relocalise_every(&explorer.settings), vec![]);
+    if search_every > 0 {
+        explorer.show_training_view(0)?;
+        let mut compare = || timed(|| explorer.photo_error(&data.start.poses[0]).map(drop));
+        compare()?;
+        recurring.push((search_every, compare()? * data.scene.train.len() as f64));
+    }
     let (pose, view) = (data.start.poses[0], data.scene.test.first().or(data.scene.val.first()));
-    let Some(view) = view else { return Ok(Trial { frame: 0.0, evaluation: 0.0 }) };
+    let Some(view) = view else { return Ok(Trial { recurring, evaluation: 0.0 }) };
     explorer.look(&pose, &view.intrinsics)?;
     let mut part = || {
         let mut seen = Rendered { rgb: vec![], depth: vec![], opacity: vec![] };
@@ -105,14 +113,19 @@ pub fn trial(explorer: &mut Explorer) -> Result<Trial, Error> {
     // The first one warms up.
     part()?;
     let frame = part()? * explorer.parts().len() as f64;
+    recurring.extend([(explorer.settings.run.picture_every, frame), (validate_every(&explorer.settings), frame)]);
+    // Scores take the same whatever is seen.
+    let pixels = view.pixels.len();
+    let seen = Rendered { rgb: view.rgb(), depth: vec![1.0; pixels], opacity: vec![1.0; pixels] };
+    let measured = frame + timed(|| scores(&seen, view, 1.0, lpips.as_deref()).map(drop))?;
+    let mut evaluation = measured;
     let steps = refine_steps(&explorer.settings);
-    let mut refined = 0.0;
     if steps > 0 {
         let mut refine = |steps| timed(|| explorer.refined(&pose, view, steps, Watch::none()).map(drop));
         refine(1)?;
-        refined = refine(1)? * steps as f64 + frame;
+        evaluation += refine(1)? * steps as f64 + measured;
     }
-    Ok(Trial { frame, evaluation: (frame + refined) * tested(&data).len() as f64 })
+    Ok(Trial { recurring, evaluation: evaluation * tested(&data).len() as f64 })
 }
 
 fn scores(seen: &Rendered, view: &View, scale: f64, lpips: Option<&Lpips>) -> Result<Scores, Error> {

@@ -250,9 +250,14 @@ impl Explorer {
 }
 
 /// Steps between two searches for lost cameras; known poses are not lost.
-fn relocalise_every(settings: &Settings) -> usize {
+pub(super) fn relocalise_every(settings: &Settings) -> usize {
     let every = settings.train.as_ref().map_or(0, |t| t.relocalise_every);
     if settings.warp.method == Method::None { 0 } else { every }
+}
+
+/// Steps between two looks at a validation view.
+pub(super) fn validate_every(settings: &Settings) -> usize {
+    settings.train.as_ref().map_or(0, |t| t.validate_every)
 }
 
 /// Sets the lens and the photo of a view.
@@ -298,7 +303,7 @@ impl Training for Explorer {
         let found = self.poses()?;
         let numbers: Vec<f64> = found.iter().flat_map(|p| p.to_rows()).collect();
         self.learner.check_finite("a pose", &numbers)?;
-        let validates = due(self.settings.train.as_ref().map_or(0, |t| t.validate_every), self.steps_done());
+        let validates = due(validate_every(&self.settings), self.steps_done());
         let validation_psnr_db = if validates { validate(self)? } else { None };
         let errors = self.data.pose_scores(&found).map_err(SpaceDataError::from)?.mean;
         let measured = Measured::Space {
