@@ -1,23 +1,19 @@
 //! Values of a region at one position of its domain (or four side by side), built on demand, each once.
 //!
-//! One file above 400 lines: each kind of value asks for its operands by the same recursive functions.
-//!
 //! A channel is a number known now or a value of the kernel: the first unrolls, the second indexes.
 
+mod folds;
+
 use super::builder::{Memory, Value};
-use super::channels::{Linear, Run, affine, is_indexable, runs_of, sequence};
+use super::channels::{Linear, Run, affine, is_indexable, runs_of};
 use super::memory::{Emit, kind};
 use super::position::{Position, is_constant, is_run};
-use super::scalar::larger;
 use super::{eigen, scalar};
 use naga::BinaryOperator as Op;
 use raygrad_compiler::graph::{Axes, Axis};
-use raygrad_compiler::plan::region::{BufferId, InstId, Region, RegionOp, Weights};
+use raygrad_compiler::plan::region::{BufferId, InstId, Region, RegionOp};
 use raygrad_compiler::scalar::DType;
 use std::collections::HashMap;
-
-/// Sums of more terms than this are loops, where the terms can be indexed.
-const UNROLL: usize = 16;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(super) enum Channel {
@@ -230,134 +226,6 @@ impl<'r> Values<'r> {
     }
 
     /// Zero, a vector where there are four positions.
-    fn zero(&mut self, e: &mut Emit) -> Value {
-        let zero = e.b.f(0.0);
-        if self.at.len() == 4 { e.b.splat(zero) } else { zero }
-    }
-
-    /// Combines `count` terms in a loop, some of them each time; term `i` is built by `term`.
-    fn fold(
-        &mut self,
-        e: &mut Emit,
-        count: usize,
-        first: Value,
-        mut step: impl FnMut(&mut Self, &mut Emit, Value, Value) -> Value,
-    ) -> Value {
-        let unroll = [4, 2, 1].into_iter().find(|u| count.is_multiple_of(*u)).unwrap_or(1) as u32;
-        let sum = e.b.var("sum", first);
-        let (from, to) = (e.b.u(0), e.b.u(count as u32));
-        let term = e.b.open_loop("term", from, to, unroll);
-        for i in 0..unroll {
-            let offset = e.b.u(i);
-            let at = e.b.add(term, offset);
-            let before = e.b.get(sum);
-            let after = step(self, e, before, at);
-            let after = if sum.is_vector() { e.b.splat(after) } else { after };
-            e.b.set(sum, after);
-        }
-        e.b.close_loop();
-        e.b.get(sum)
-    }
-
-    /// Sum of some channels.
-    fn sum(&mut self, e: &mut Emit, of: InstId, group: &[u32]) -> Value {
-        if let Some((first, step)) = sequence(group)
-            && group.len() > UNROLL
-            && step >= 0
-            && is_indexable(self.region, of)
-        {
-            let zero = self.zero(e);
-            return self.fold(e, group.len(), zero, |values, e, sum, i| {
-                let (first, step) = (e.b.u(first), e.b.u(step as u32));
-                let i = e.b.mul(i, step);
-                let i = e.b.add(i, first);
-                let term = values.channel(e, of, Channel::Var(i));
-                e.b.add(sum, term)
-            });
-        }
-        let mut sum: Option<Value> = None;
-        for c in group {
-            let term = self.channel(e, of, Channel::At(*c));
-            e.b.topic("sum");
-            sum = Some(sum.map_or(term, |s| e.b.add(s, term)));
-        }
-        sum.unwrap_or_else(|| e.b.f(0.0))
-    }
-
-    fn channel_max(&mut self, e: &mut Emit, of: InstId) -> Value {
-        let channels = self.region.inst(of).channels;
-        let first = self.channel(e, of, Channel::At(0));
-        if channels > UNROLL && is_indexable(self.region, of) {
-            let first = if self.at.len() == 4 { e.b.splat(first) } else { first };
-            return self.fold(e, channels, first, |values, e, most, i| {
-                let next = values.channel(e, of, Channel::Var(i));
-                larger(&mut e.b, most, next)
-            });
-        }
-        (1..channels as u32).fold(first, |most, c| {
-            let next = self.channel(e, of, Channel::At(c));
-            e.b.topic("largest");
-            larger(&mut e.b, most, next)
-        })
-    }
-
-    /// A channel of a layer, element by element: for what no tiled kernel covers.
-    fn linear(&mut self, e: &mut Emit, x: InstId, w: &Weights, channel: Channel) -> Value {
-        let (buffer, first) = (w.buffer, w.first as u32);
-        let weight = move |values: &mut Self, e: &mut Emit, c: Channel| {
-            e.b.topic("weight");
-            let (c, first) = (c.value(e), e.b.u(first));
-            let c = e.b.add(c, first);
-            values.load(e, buffer, Channel::Var(c))
-        };
-        self.contract(e, x, (w.rows, w.columns), w.transposed, channel, true, weight)
-    }
-
-    /// `sum_i x_i W_io` (or with W transposed), where `weight` gives a channel of W.
-    #[expect(clippy::too_many_arguments, reason = "what the three kinds of layers differ in")]
-    fn contract(
-        &mut self,
-        e: &mut Emit,
-        x: InstId,
-        (rows, columns): (usize, usize),
-        transposed: bool,
-        out: Channel,
-        indexable: bool,
-        mut weight: impl FnMut(&mut Self, &mut Emit, Channel) -> Value,
-    ) -> Value {
-        let terms = if transposed { columns } else { rows };
-        let columns = columns as u32;
-        let at = |e: &mut Emit, i: Channel| match (i, out) {
-            (Channel::At(i), Channel::At(o)) if transposed => Channel::At(o * columns + i),
-            (Channel::At(i), Channel::At(o)) => Channel::At(i * columns + o),
-            _ => {
-                let (i, o, columns) = (i.value(e), out.value(e), e.b.u(columns));
-                let (row, column) = if transposed { (o, i) } else { (i, o) };
-                let row = e.b.mul(row, columns);
-                Channel::Var(e.b.add(row, column))
-            }
-        };
-        if terms > UNROLL && indexable && is_indexable(self.region, x) {
-            let zero = self.zero(e);
-            return self.fold(e, terms, zero, |values, e, sum, i| {
-                let c = at(e, Channel::Var(i));
-                let (x, w) = (values.channel(e, x, Channel::Var(i)), weight(values, e, c));
-                e.b.fma(x, w, sum)
-            });
-        }
-        let mut sum: Option<Value> = None;
-        for i in 0..terms as u32 {
-            let c = at(e, Channel::At(i));
-            let (x, w) = (self.channel(e, x, Channel::At(i)), weight(self, e, c));
-            e.b.topic("layer");
-            sum = Some(match sum {
-                Some(sum) => e.b.fma(x, w, sum),
-                None => e.b.mul(x, w),
-            });
-        }
-        sum.unwrap_or_else(|| e.b.f(0.0))
-    }
-
     /// Channel `c` of a choice or of sums of channels: a branch a range of c.
     fn choose(&mut self, e: &mut Emit, id: InstId, c: Value) -> Value {
         let inst = self.region.inst(id);

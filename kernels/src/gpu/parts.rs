@@ -3,12 +3,14 @@
 //! Values that a part needs and another computes go through memory: through the buffer they are written to anyway, or
 //! through scratch memory. The order of parts is: sums over what the region reads, layers, other values written, sums
 //! over what was written. A value that replaces an input which a later part still reads is put aside and copied last.
-//!
-//! One file above 400 lines: the parts are cut by one pass that holds their common state.
+
+mod aside;
 
 use super::elements::{self, closure};
 use super::half::is_multiplied;
+use super::homes::Homes;
 use super::layout::{Layout, Limits};
+use super::regions::{empty, push_load, replace_by_load, swept_with, written_by};
 use super::{Kernel, LowerError, layer, outer, reduce, resident, scan, scatter, stages};
 use raygrad_compiler::graph::{Axes, Shape};
 use raygrad_compiler::ops::Reduction;
@@ -60,7 +62,7 @@ pub(super) fn lower(layout: &mut Layout, limits: Limits, launch: &Launch) -> Res
     split.run()?;
     let Split { sums, writers, late, .. } = split;
     let mut parts: Vec<Part> = sums.into_iter().chain(writers).chain(late).collect();
-    put_aside(layout, &launch.region, &mut parts)?;
+    aside::put_aside(layout, &launch.region, &mut parts)?;
     let several = parts.len() > 1;
     let mut kernels = vec![];
     for (i, part) in parts.into_iter().enumerate() {
@@ -387,151 +389,4 @@ impl Split<'_, '_> {
         }
         Ok(())
     }
-}
-
-/// Where a value is written and a later kernel may read it: to a buffer that the region itself does not read.
-pub(super) fn written_by(region: &Region, value: InstId) -> Option<BufferId> {
-    let reads = region.reads();
-    let written = region.stores.iter().find(|s| s.values()[0] == value && !reads.contains(&s.buffer()));
-    written.map(Store::buffer)
-}
-
-/// Which layer's kernel computes a value: a layer's epilogue is every pointwise value of the same channels after it.
-struct Homes {
-    /// The layers, in order.
-    layers: Vec<InstId>,
-    /// Per value, the layer in whose epilogue it is.
-    home: Vec<Option<usize>>,
-    /// The last layer it depends on.
-    level: Vec<Option<usize>>,
-    /// Whether it is needed outside the kernel that computes it.
-    cut: Vec<bool>,
-}
-
-impl Homes {
-    fn of(region: &Region) -> Homes {
-        let n = region.body.len();
-        let mut homes = Homes { layers: vec![], home: vec![None; n], level: vec![None; n], cut: vec![false; n] };
-        for id in region.ids() {
-            let (at, inst) = (id.0 as usize, region.inst(id));
-            let level = inst.inputs.iter().filter_map(|i| homes.level[i.0 as usize]).max();
-            homes.level[at] = level;
-            if is_layer(region, id) && !is_little(region, id) {
-                homes.home[at] = Some(homes.layers.len());
-                homes.level[at] = homes.home[at];
-                homes.layers.push(id);
-                continue;
-            }
-            let aligned = |i: &InstId| {
-                matches!(inst.op, RegionOp::Map(_))
-                    && region.inst(*i).channels == inst.channels
-                    && homes.home[i.0 as usize] == level
-            };
-            if level.is_some() && inst.inputs.iter().any(aligned) {
-                homes.home[at] = level;
-            }
-            for i in &inst.inputs {
-                let i = i.0 as usize;
-                let elsewhere = homes.home[i].is_some() && homes.home[i] != homes.home[at];
-                // The epilogue works channel by channel: a narrower value of the same layer comes from memory.
-                let narrower = homes.home[i].is_some() && region.body[i].channels != inst.channels;
-                if elsewhere || narrower {
-                    homes.cut[i] = true;
-                }
-                if narrower && homes.home[at] == homes.home[i] {
-                    homes.home[at] = None;
-                }
-            }
-            if homes.home[at].is_none() {
-                inst.inputs.iter().filter(|i| homes.home[i.0 as usize].is_some()).for_each(|i| {
-                    homes.cut[i.0 as usize] = true;
-                });
-            }
-        }
-        homes
-    }
-}
-
-/// Terms of a layer that the epilogue of another may compute.
-const LITTLE: usize = 4;
-
-/// Whether a value is a product with weights that has a kernel.
-fn is_layer(region: &Region, id: InstId) -> bool {
-    let inst = region.inst(id);
-    matches!(inst.op, RegionOp::Linear(_)) && matches!(region.inst(inst.inputs[0]).op, RegionOp::Load(_))
-}
-
-/// Whether a layer has so few terms that the epilogue of the one it is added to computes it.
-fn is_little(region: &Region, id: InstId) -> bool {
-    let terms = |id: InstId| region.inst(region.inst(id).inputs[0]).channels;
-    let beside = |other: &InstId| *other != id && is_layer(region, *other) && terms(*other) > LITTLE;
-    let mut users = region.body.iter().filter(|user| user.inputs.contains(&id));
-    terms(id) <= LITTLE
-        && !region.stores.iter().any(|s| s.values().contains(&id))
-        && users.all(|user| matches!(user.op, RegionOp::Map(_)) && user.inputs.iter().any(beside))
-}
-
-/// Redirects writes that replace a buffer which a later part, or another invocation of the same part, still reads.
-fn put_aside(layout: &mut Layout, original: &Region, parts: &mut Vec<Part>) -> Result<(), LowerError> {
-    let replaced: Vec<BufferId> = {
-        let reads = original.reads();
-        original.stores.iter().map(Store::buffer).filter(|b| reads.contains(b)).collect()
-    };
-    let mut copies = vec![];
-    for buffer in replaced {
-        let writes = |p: &mut Part| p.region().stores.iter().any(|s| s.buffer() == buffer);
-        let Some(writer) = parts.iter_mut().position(writes) else { continue };
-        let later = parts[writer + 1..].iter_mut().any(|p| p.region().reads().contains(&buffer));
-        if !later && matches!(parts[writer], Part::Elements(_)) {
-            continue;
-        }
-        let aside = layout.scratch("aside", layout.shape(buffer).clone())?;
-        for store in &mut parts[writer].region().stores {
-            if let Store::Write { buffer: b, .. } = store
-                && *b == buffer
-            {
-                *b = aside;
-            }
-        }
-        let mut copy = Region { domain: layout.shape(buffer).axes.clone(), ..empty(original) };
-        let value = push_load(layout, &mut copy, aside);
-        copy.stores.push(Store::Write { value, buffer });
-        copies.push(Part::Elements(copy));
-    }
-    parts.extend(copies);
-    Ok(())
-}
-
-/// The same loop without contents.
-pub(super) fn empty(region: &Region) -> Region {
-    Region { body: vec![], stores: vec![], whole: false, ..region.clone() }
-}
-
-pub(super) fn push_load(layout: &Layout, region: &mut Region, buffer: BufferId) -> InstId {
-    let shape = layout.shape(buffer);
-    region.body.push(Inst {
-        op: RegionOp::Load(buffer),
-        inputs: vec![],
-        axes: shape.axes.clone(),
-        channels: shape.channels.count(),
-        dtype: shape.dtype,
-        label: layout.name(buffer).into(),
-        source: std::panic::Location::caller(),
-    });
-    InstId(region.body.len() as u32 - 1)
-}
-
-/// Makes a value a load of `buffer`.
-pub(super) fn replace_by_load(layout: &Layout, region: &mut Region, id: InstId, buffer: BufferId) {
-    let axes = layout.shape(buffer).axes.clone();
-    let inst = &mut region.body[id.0 as usize];
-    debug_assert!(inst.dtype == DType::F32 || layout.shape(buffer).dtype == inst.dtype);
-    *inst = Inst { op: RegionOp::Load(buffer), inputs: vec![], axes, ..inst.clone() };
-}
-
-/// Drops what no store needs; also tells the new id of a value that is needed.
-fn swept_with(region: Region, id: InstId) -> (Region, InstId) {
-    let needed = closure(&region, region.stores.iter().flat_map(|s| s.values()));
-    let before = needed[..id.0 as usize].iter().filter(|n| **n).count();
-    (region.swept(), InstId(before as u32))
 }

@@ -8,7 +8,7 @@
 use super::LowerError;
 use super::elements::{self, closure, own_cost};
 use super::layout::Layout;
-use super::parts::{replace_by_load, written_by};
+use super::regions::{replace_by_load, written_by};
 use raygrad_compiler::graph::Shape;
 use raygrad_compiler::plan::region::{BufferId, InstId, Region, RegionOp, Store};
 
