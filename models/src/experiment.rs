@@ -57,6 +57,8 @@ pub trait Observer {
     fn loading(&self) -> Box<dyn Fn(usize, usize) + Sync> {
         Box::new(|_, _| {})
     }
+    /// Something had to be assumed of the scene.
+    fn note(&mut self, _note: &str) {}
     /// How long what is left should take on this device, by its name.
     fn expected(&mut self, _estimate: &Estimate, _device: &str) {}
     /// The run begins, or goes on, after `done` of `steps` steps.
@@ -214,6 +216,7 @@ impl Experiment {
     pub fn restored_explorer(&self) -> Result<Explorer, Error> {
         let mut explorer = self.explorer()?;
         self.restore(&mut explorer)?;
+        explorer.settle()?;
         Ok(explorer)
     }
 
@@ -248,6 +251,7 @@ impl Experiment {
             false => RunFolder::claim(&path, settings)?,
         };
         let mut trainer = self.training_after(&*observer.loading())?;
+        trainer.notes().iter().for_each(|note| observer.note(note));
         let mut run = Run { metrics: Metrics::default(), seconds: 0.0, begun: Instant::now(), kept: None };
         if self.resume {
             let checkpoint = self.restore(&mut *trainer)?;

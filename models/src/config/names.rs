@@ -38,10 +38,13 @@ impl Settings {
             Some(scene) => (&scene.path, Path::file_name),
             None => (&self.data.image, Path::file_stem),
         };
-        let name = part(Path::new(path)).map_or(path.into(), |n| n.to_string_lossy());
+        // `.` and `..` are called what they are from further up.
+        let whole = || Some(part(&Path::new(path).canonicalize().ok()?)?.to_string_lossy().into_owned());
+        let name = part(Path::new(path)).map(|n| n.to_string_lossy().into_owned()).or_else(whole);
+        let name = name.unwrap_or_else(|| path.into());
         match name.rsplit_once('_') {
             Some((_, scan)) if scan.starts_with("scan") => scan.to_string(),
-            _ => name.into_owned(),
+            _ => name,
         }
     }
 

@@ -76,6 +76,7 @@ pub struct SceneSettings {
     pub poses: String,
     /// In pixels of the image file; 0 where it is not given.
     pub focal: f64,
+    pub published_rotations: bool,
 }
 
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -99,6 +100,9 @@ pub struct TrainSettings {
     pub density_noise: f64,
     pub opaque_background: bool,
     pub refine_steps: usize,
+    pub refine_lens: RefineLens,
+    /// Pixels along a side of the grid on which poses are fitted once more before they are measured; 0 for those of the last step.
+    pub fit_grid: usize,
     /// Steps between two searches for lost cameras; 0 for none.
     pub relocalise_every: usize,
     /// Steps between two looks at a validation view; 0 for none.
@@ -127,6 +131,16 @@ pub enum DepthSettings {
     Auto,
     /// What the scene's layout says.
     Scene,
+}
+
+/// Which parts of the lenses are trained.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum RefineLens {
+    None,
+    Focal,
+    /// Focal lengths and principal points.
+    All,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

@@ -34,6 +34,6 @@ pub use mesh_reader::MeshFileError;
 pub use novel_path::{FRAMES, anchor, novel_view_path};
 pub use pose_error::{PoseErrors, pose_errors, rotation_angle};
 pub use published::{PublishedRow, PublishedTable, published, published_for, published_of};
-pub use scores::{Evaluation, Measured, Metric, Scores, Stage, ViewScores, success_px};
+pub use scores::{Evaluation, FoundLens, Measured, Metric, Scores, Stage, ViewScores, success_px};
 pub use table::{Cell, Row, Table};
 pub use video::{Video, VideoError, write_video, write_video_with};

@@ -1,6 +1,8 @@
 //! What was measured of one run: per view and on average, before and after test-time refinement.
 
+use crate::scene::Intrinsics;
 use serde::{Deserialize, Serialize};
+use std::fmt;
 
 /// A quantity the papers report.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -257,6 +259,41 @@ pub struct Evaluation {
     /// [`Similarity::is_ill_conditioned`](super::Similarity::is_ill_conditioned).
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub undetermined: bool,
+    /// Where lenses were refined, what was found.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub lens: Option<FoundLens>,
+}
+
+/// How refined lenses differ from those that were given, the same for all views.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct FoundLens {
+    /// Found focal lengths, along x and y, as multiples of the given ones.
+    pub focal_scale: [f64; 2],
+    /// By how much principal points moved, along x and y, in given focal lengths.
+    pub principal_shift: [f64; 2],
+}
+
+impl FoundLens {
+    /// A lens as it was found.
+    pub fn of(&self, given: &Intrinsics) -> Intrinsics {
+        let (scale, shift) = (self.focal_scale, self.principal_shift);
+        let (cx, cy) = (given.cx + shift[0] * given.fx, given.cy + shift[1] * given.fy);
+        Intrinsics { fx: given.fx * scale[0], fy: given.fy * scale[1], cx, cy, ..given.clone() }
+    }
+}
+
+impl fmt::Display for FoundLens {
+    fn fmt(&self, f: &mut fmt::Formatter) -> fmt::Result {
+        let ([a, b], [u, v]) = (self.focal_scale, self.principal_shift);
+        match a == b {
+            true => write!(f, "focal lengths x {a:.4}")?,
+            false => write!(f, "focal lengths x {a:.4} and {b:.4}")?,
+        }
+        if (u, v) != (0.0, 0.0) {
+            write!(f, ", principal points {u:+.4} and {v:+.4} focal lengths from where they were taken to be")?;
+        }
+        Ok(())
+    }
 }
 
 impl Evaluation {
@@ -267,11 +304,13 @@ impl Evaluation {
     }
 
     /// What is to be said wherever the numbers are shown.
-    pub fn note(&self) -> Option<&'static str> {
-        self.undetermined.then_some(
+    pub fn notes(&self) -> Vec<String> {
+        let undetermined = self.undetermined.then(|| {
             "the camera centres, found or true, lie in one point or on one line, which does not determine the turn that \
-             aligns them: errors of poses and test views mean little",
-        )
+             aligns them: errors of poses and test views mean little"
+                .to_string()
+        });
+        undetermined.into_iter().chain(self.lens.map(|lens| format!("lenses were refined: {lens}"))).collect()
     }
 
     /// The views of a stage.

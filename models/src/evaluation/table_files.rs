@@ -33,8 +33,9 @@ impl Table {
     fn notes(&self) -> Vec<String> {
         let mut notes: Vec<String> = vec![];
         for run in &self.evaluations {
-            let note = run.note().map(|note| format!("{} on {}: {note}", run.method, run.scene));
-            notes.extend(note.filter(|n| !notes.contains(n)));
+            let of_run = run.notes().into_iter().map(|note| format!("{} on {}: {note}", run.method, run.scene));
+            let new: Vec<String> = of_run.filter(|n| !notes.contains(n)).collect();
+            notes.extend(new);
         }
         notes
     }
@@ -199,6 +200,7 @@ mod tests {
         let picture = |psnr_db| Scores { psnr_db: Some(psnr_db), ..Scores::default() };
         Evaluation {
             undetermined: false,
+            lens: None,
             scene: scene.into(),
             method: method.into(),
             cameras: Measured::new(vec![view("cam, 1", camera)]),

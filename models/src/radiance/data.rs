@@ -79,9 +79,10 @@ impl SpaceData {
             dtu_split: DtuSplit::from_name(&wanted.dtu_split).unwrap_or_default(),
             focal: (wanted.focal > 0.0).then_some(wanted.focal),
             no_train_depths: true,
+            published_rotations: wanted.published_rotations,
             ..LoadOptions::default()
         };
-        let scene = match wanted.path.as_str() {
+        let mut scene = match wanted.path.as_str() {
             BUILTIN => {
                 let folder = tempfile::tempdir().map_err(|source| WriteError { path: std::env::temp_dir(), source })?;
                 let made = MakeOptions { views: VIEWS, size: picture[0].max(picture[1]), seed: 0 };
@@ -92,7 +93,7 @@ impl SpaceData {
         };
         let truth: Option<Vec<Pose>> = scene.train.iter().map(|v: &View| v.pose).collect();
         let names = || scene.training_poses();
-        let (noise, seed) = (&settings.noise, settings.run.seed);
+        let (noise, seed, mut notes) = (&settings.noise, settings.run.seed, vec![]);
         let start = match (wanted.poses_in(scene.layout), noise.kind) {
             ("truth", _) => InitialPoses::Truth.draw(names(), seed)?,
             ("identity", _) => {
@@ -109,10 +110,18 @@ impl SpaceData {
                 InitialPoses::L2g { rotation: noise.rotation, translation: noise.translation }.draw(names(), seed)?
             }
             (file, _) => match NamedPoses::load(Path::new(file)).map_err(NoiseError::from)? {
-                Some(named) => started_from(&named, Path::new(file), &scene)?,
-                None => PoseStart::load(Path::new(file), names())?,
+                Some(named) => {
+                    let (start, lacking) = started_from(&named, Path::new(file), &scene)?;
+                    notes.extend(lacking);
+                    start
+                }
+                None => {
+                    PoseStart::check_views(Path::new(file), names())?;
+                    PoseStart::load(Path::new(file), names())?
+                }
             },
         };
+        scene.notes.extend(notes);
         if settings.train.as_ref().is_some_and(|t| t.ndc) {
             let away = start.poses.iter().filter(|p| p.rotation[(2, 2)] <= 0.0).count();
             if away > 0 {
@@ -195,22 +204,35 @@ impl SpaceData {
 }
 
 /// Poses of other programs as a start. Those of another world are aligned with the true ones, as the INN paper does it with
-/// COLMAP's; where nothing is true they are taken for those of the scene's files. Views without a pose start at the identity.
-fn started_from(named: &NamedPoses, path: &Path, scene: &Scene) -> Result<PoseStart, SpaceDataError> {
+/// COLMAP's; where nothing is true they are taken for those of the scene's files. Views without a pose start at the identity, and
+/// are told.
+fn started_from(named: &NamedPoses, path: &Path, scene: &Scene) -> Result<(PoseStart, Option<String>), SpaceDataError> {
     let views: Vec<&str> = scene.train.iter().map(|v| v.name.as_str()).collect();
     let mut poses = named.of_views(path, &views)?;
     if named.world == World::Other {
         let both = poses.iter().zip(&scene.train).filter_map(|(found, view)| Some(((*found)?, view.pose?)));
         let (found, truth): (Vec<Pose>, Vec<Pose>) = both.unzip();
-        if truth.len() > 1 {
-            let similarity = Alignment::of_inn(truth.len()).fit(&found, &truth)?;
+        let known = scene.train.iter().any(|v| v.pose.is_some());
+        if known && truth.len() < 2 {
+            let message = format!(
+                "poses of {} views of which true ones are known: to be moved into the scene's world it takes two",
+                truth.len()
+            );
+            return Err(NoiseError::Format { path: path.into(), message }.into());
+        }
+        if known {
+            let similarity = Alignment::Pairwise.fit(&found, &truth)?;
             poses.iter_mut().flatten().for_each(|p| *p = similarity.align(&[*p])[0]);
         } else {
             poses.iter_mut().flatten().for_each(|p| *p = scene.frame.load(p));
         }
     }
+    let (lacking, all) = (poses.iter().filter(|p| p.is_none()).count(), poses.len());
+    let note = (lacking > 0).then(|| {
+        format!("{lacking} of {all} training views have no pose in {}: they start at the identity", path.display())
+    });
     let poses = poses.into_iter().map(|p| p.unwrap_or_else(Pose::identity)).collect();
-    Ok(PoseStart { poses, noise: None })
+    Ok((PoseStart { poses, noise: None }, note))
 }
 
 #[cfg(test)]

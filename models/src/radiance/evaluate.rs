@@ -41,7 +41,8 @@ pub fn evaluate(
     mut show: impl FnMut(&Seen) -> Result<(), Error>,
 ) -> Result<Found, Error> {
     let (data, lpips) = (explorer.data.clone(), explorer.lpips.clone());
-    let poses = explorer.poses()?;
+    explorer.settle()?;
+    let (poses, lens) = (explorer.poses()?, explorer.found_lens()?);
     let similarity = data.similarity(&poses).map_err(SpaceDataError::from)?;
     let cameras = data.pose_scores(&poses).map_err(SpaceDataError::from)?;
     let settings = &explorer.settings;
@@ -67,7 +68,7 @@ pub fn evaluate(
     }
     let measured = |views: Vec<ViewScores>| (!views.is_empty()).then(|| Measured::new(views));
     let (before, after, undetermined) = (measured(before), measured(after), similarity.is_ill_conditioned());
-    let evaluation = Evaluation { scene, method, cameras, before, after, undetermined };
+    let evaluation = Evaluation { scene, method, cameras, before, after, undetermined, lens };
     Ok(Found { evaluation, poses, similarity })
 }
 
@@ -182,6 +183,7 @@ mod tests {
         let mut view = View {
             name: "v".into(),
             file: "v.png".into(),
+            file_size: [1, 1],
             removed_distortion: None,
             pixels: vec![[51, 102, 204, 255]; n],
             transparent: false,

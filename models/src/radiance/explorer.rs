@@ -3,13 +3,14 @@
 use super::data::{SpaceData, SpaceDataError};
 use super::error_map;
 use super::evaluate::{trial, validate};
+use super::lens;
 use super::model::{self, RadianceModel, nothing_found};
 use super::relocalise::relocalise;
 use super::results;
 use crate::Error;
-use crate::config::{DepthSettings, Layered, Method, Settings};
+use crate::config::{DepthSettings, Layered, Method, RefineLens, Settings};
 use crate::estimate::Trial;
-use crate::evaluation::{Evaluation, Lpips, Metric, Stage};
+use crate::evaluation::{Evaluation, FoundLens, Lpips, Metric, Stage};
 use crate::geometry::Pose;
 use crate::run::metrics::{Entry, Final, Measured, Metrics, Relocalised};
 use crate::run::{Checkpoint, RunFolder};
@@ -41,6 +42,7 @@ pub struct Explorer {
     /// Compiled when they are first needed.
     density: Option<ProgramId>,
     comparison: Option<ProgramId>,
+    fit: Option<ProgramId>,
     /// Pixels of one run of `view`.
     view_pixels: usize,
     rays: usize,
@@ -83,7 +85,7 @@ impl Explorer {
         learner.set(model::FOUND, &nothing_found(views))?;
         let side = settings.train.as_ref().map_or(0, |t| t.error_map);
         learner.set(error_map::ERROR_MAP, &error_map::untried(views, side))?;
-        let intrinsics: Vec<f32> = data.scene.train.iter().flat_map(|v| lens(&v.intrinsics)).collect();
+        let intrinsics: Vec<f32> = data.scene.train.iter().flat_map(|v| given_lens(&v.intrinsics)).collect();
         learner.set(model::INTRINSICS, &intrinsics)?;
         let relocalises = relocalise_every(settings) > 0;
         let mut photos = vec![];
@@ -95,7 +97,7 @@ impl Explorer {
             photos.extend(relocalises.then_some(pixels));
         }
         let (data, settings, rays) = (Arc::new(data), settings.clone(), model.rays_per_view() * views);
-        let (lpips, density, comparison, evaluation) = (None, None, None, None);
+        let (lpips, density, comparison, fit, evaluation) = (None, None, None, None, None);
         Ok(Explorer {
             data,
             settings,
@@ -107,6 +109,7 @@ impl Explorer {
             refine,
             density,
             comparison,
+            fit,
             view_pixels,
             rays,
             relocalised: vec![],
@@ -120,6 +123,31 @@ impl Explorer {
         let (rough, found) = (self.learner.session.get(model::POSES)?, self.learner.session.get(model::FOUND)?);
         let one = |(rough, found)| Pose::from_rows::<f32>(rough).after(&Pose::from_rows(found));
         Ok(rough.chunks(12).zip(found.chunks(12)).map(one).collect())
+    }
+
+    /// Fits the poses of the training views once more, at pixels of a grid, where `train.fit_grid` asks for that: the last
+    /// step's hang on the pixels that it drew. To be called when nothing is trained any more.
+    pub fn settle(&mut self) -> Result<(), Error> {
+        let side = self.settings.train.as_ref().map_or(0, |t| t.fit_grid);
+        if side == 0 {
+            return Ok(());
+        }
+        let pixels = self.data.size.grid(side);
+        let program = match self.fit {
+            Some(program) => program,
+            None => self.learner.add(&self.model.fit(pixels.len()))?,
+        };
+        self.fit = Some(program);
+        self.learner.set_u32(model::FIT_PIXELS, &pixels)?;
+        self.learner.run(program)
+    }
+
+    /// What was found of the lenses, where they are refined.
+    pub fn found_lens(&mut self) -> Result<Option<FoundLens>, Error> {
+        if self.settings.train.as_ref().is_none_or(|t| t.refine_lens == RefineLens::None) {
+            return Ok(None);
+        }
+        Ok(Some(lens::found(&self.learner.session.get(lens::LENS)?)))
     }
 
     /// A pose of the true world in the learned one, by the poses that the last step found.
@@ -141,7 +169,7 @@ impl Explorer {
 
     /// The camera of the parts that are rendered next.
     pub(super) fn look(&mut self, pose: &Pose, intrinsics: &Intrinsics) -> Result<(), Error> {
-        self.learner.set(model::VIEW_INTRINSICS, &lens(intrinsics))?;
+        self.learner.set(model::VIEW_INTRINSICS, &given_lens(intrinsics))?;
         self.set_pose(pose)
     }
 
@@ -262,7 +290,7 @@ pub(super) fn validate_every(settings: &Settings) -> usize {
 
 /// Sets the lens and the photo of a view.
 fn show(learner: &mut Learner, camera: &Intrinsics, photo: &[u32]) -> Result<(), Error> {
-    learner.set(model::VIEW_INTRINSICS, &lens(camera))?;
+    learner.set(model::VIEW_INTRINSICS, &given_lens(camera))?;
     learner.set_u32(model::VIEW_IMAGE, photo)
 }
 
@@ -272,7 +300,7 @@ fn flat_rows(poses: &[Pose]) -> Vec<f32> {
 }
 
 /// fx, fy, cx, cy.
-fn lens(camera: &Intrinsics) -> [f32; 4] {
+fn given_lens(camera: &Intrinsics) -> [f32; 4] {
     [camera.fx, camera.fy, camera.cx, camera.cy].map(|x| x as f32)
 }
 
@@ -354,6 +382,9 @@ impl Training for Explorer {
     fn trial(&mut self) -> Result<Trial, Error> {
         trial(self)
     }
+    fn notes(&self) -> &[String] {
+        &self.data.scene.notes
+    }
     fn summary(&self, last: &Final) -> String {
         let (steps, time) = (last.entry.step, crate::report::duration(last.seconds));
         let mut text = String::new();
@@ -371,7 +402,7 @@ impl Training for Explorer {
             let name = format!("test {}", metric.heading());
             text += &format!("{name:<18} {before:.0$}{refined}\n", metric.decimals());
         }
-        if let Some(note) = self.evaluation.as_ref().and_then(Evaluation::note) {
+        for note in self.evaluation.iter().flat_map(Evaluation::notes) {
             text += &format!("note: {note}\n");
         }
         text + &format!("training PSNR      {:.2} dB\nsteps              {steps} in {time}\n", last.entry.psnr_db())

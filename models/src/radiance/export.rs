@@ -14,9 +14,9 @@ const FAR: f64 = 100.0;
 
 impl Explorer {
     /// The training cameras at the poses found, aligned with the true ones, in the world and unit of the scene's files; for
-    /// images of the size that was trained with.
+    /// images of the files' own size.
     pub fn cameras(&mut self) -> Result<Vec<ExportCamera>, Error> {
-        let found = self.poses()?;
+        let (found, refined) = (self.poses()?, self.found_lens()?);
         let aligned = self.data.similarity(&found).map_err(SpaceDataError::from)?.align(&found);
         let scene = &self.data.scene;
         let bounds = match scene.depth {
@@ -24,7 +24,9 @@ impl Explorer {
             DepthRange::Inverse { near } => [near / NEAR_PART, FAR * near / NEAR_PART],
         };
         let camera = |(view, pose): (&crate::scene::View, _)| {
-            let lens = &view.intrinsics;
+            let lens = refined.map_or(view.intrinsics.clone(), |found| found.of(&view.intrinsics));
+            let [height, width] = view.file_size;
+            let lens = lens.resized(height, width);
             ExportCamera {
                 name: exported_name(&scene.root, &view.file),
                 width: lens.width,

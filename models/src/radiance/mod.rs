@@ -5,6 +5,7 @@ mod error_map;
 pub mod evaluate;
 pub mod explorer;
 mod export;
+mod lens;
 mod mesh;
 pub mod model;
 mod novel_views;

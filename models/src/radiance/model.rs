@@ -13,6 +13,7 @@
 //! fitted poses are kept as a state: near and far follow them in the next step, and evaluation starts from them.
 
 use super::error_map::ErrorMap;
+use super::lens::Lens;
 use super::rays::{Cameras, ImageSize, Rays, range_of};
 use super::rendering::{Purpose, Rendering, Seen};
 use crate::config::{DepthSettings, RadianceSettings, SceneSettings, Settings, TrainSettings};
@@ -53,6 +54,8 @@ pub const TWIST: &str = "view.twist";
 pub const TWIST_LR: &str = "view.lr";
 pub const TWIST_BIAS1: &str = "view.bias1";
 pub const TWIST_BIAS2: &str = "view.bias2";
+/// Pixels at which the poses of the training views are fitted once more.
+pub const FIT_PIXELS: &str = "fit.pixels";
 /// Points whose density is asked for, `[place] x 3`.
 pub const DENSITY_POINTS: &str = "density.points";
 
@@ -67,6 +70,7 @@ pub struct RadianceModel {
     train: TrainSettings,
     warp: Arc<dyn Warp>,
     rendering: Rendering,
+    lens: Lens,
     frame: Axis,
     pixel: Axis,
     code: Option<Parameter>,
@@ -98,10 +102,10 @@ impl RadianceModel {
         let frame = warp.frame().cloned().unwrap_or_else(|| Axis::new("frame", views));
         let pixel = Axis::new("pixel", size.pixels());
         let code = warps::codes(&*warp, &frame);
-        let rendering = Rendering::new(settings)?;
+        let (rendering, lens) = (Rendering::new(settings)?, Lens::new(train.refine_lens));
         let scales_loss = scales_loss(settings.run.precision, TargetKind::Gpu);
         let (settings, train) = (settings.clone(), train.clone());
-        Ok(RadianceModel { settings, size, train, warp, rendering, frame, pixel, code, scales_loss })
+        Ok(RadianceModel { settings, size, train, warp, rendering, lens, frame, pixel, code, scales_loss })
     }
 
     /// The model whose steps run on devices of this kind.
@@ -117,11 +121,12 @@ impl RadianceModel {
 
     /// Everything that is trained.
     pub fn parameters(&self) -> Vec<Parameter> {
-        self.rendering.parameters().into_iter().chain(self.warp_parameters()).collect()
+        self.rendering.parameters().into_iter().chain(self.camera_parameters()).collect()
     }
 
-    fn warp_parameters(&self) -> Vec<Parameter> {
-        self.code.clone().into_iter().chain(self.warp.parameters()).collect()
+    /// What is trained at the warp's rate.
+    fn camera_parameters(&self) -> Vec<Parameter> {
+        self.code.iter().chain(&self.lens.correction).cloned().chain(self.warp.parameters()).collect()
     }
 
     /// Rays of every image in one step.
@@ -163,16 +168,11 @@ impl RadianceModel {
 
     /// The same where a map of errors has drawn the pixels.
     fn step_of(&self, ray: &Axis, index: &Tensor, colors: &Tensor, map: Option<ErrorMap>) -> Step {
-        let intrinsics = Tensor::data(INTRINSICS, Shape::new(&[&self.frame], 4));
-        let rough = Tensor::input(POSES, Role::State, Shape::new(&[&self.frame], (3, 4)));
-        let cameras = Cameras::new(&self.frame, ray, index, self.size, &intrinsics, &rough);
-        let none = Tensor::scalar(0.0);
-        let code = self.code.as_ref().map_or(&none, |c| &c.tensor);
-        let pinned = self.settings.warp.fix_first;
-        let found = Registration::new(&*self.warp, &cameras.pixels, Some(&cameras.centers), code, pinned);
+        let (rough, intrinsics) = (self.rough_poses(), self.intrinsics());
+        let found = self.registered(ray, index);
         let center = found.centers.as_ref().unwrap_or(&found.local);
         let rays = Rays::through(center, &found.local);
-        let known = Tensor::input(FOUND, Role::State, Shape::new(&[&self.frame], (3, 4)));
+        let known = self.known_poses();
         let range = match self.train.depth {
             DepthSettings::Auto => range_of(&compose_poses(&rough, &known), &self.frame),
             _ => self.fixed_range(),
@@ -189,19 +189,38 @@ impl RadianceModel {
             Some((penalty, weight)) if *weight > 0.0 => aligned + penalty * *weight,
             _ => aligned,
         };
-        let transform = found.transform.broadcast_to(&Axes::new([self.frame.clone()]));
+        let transform = self.along_frames(&found.transform);
         let mut outputs = vec![("render", render), ("total", total.clone()), ("found", transform.clone())];
         outputs.extend(fine.map(|f| ("render_fine", f)));
         outputs.extend(found.residual.map(|r| ("alignment", r)));
         outputs.extend(found.penalty.map(|(p, _)| ("penalty", p)));
         let outputs = outputs.into_iter().map(|(name, t)| (name.to_string(), t)).collect();
-        let mut updates = updates(&total, &self.rendering.parameters(), &self.warp_parameters(), self.scales_loss);
-        if let (true, Some(code)) = (pinned && self.warp.zero_code_is_identity(), &self.code) {
+        let mut updates = updates(&total, &self.rendering.parameters(), &self.camera_parameters(), self.scales_loss);
+        let pinned = self.settings.warp.fix_first && self.warp.zero_code_is_identity();
+        if let (true, Some(code)) = (pinned, &self.code) {
             hold_first(&mut updates, &code.tensor, &self.frame);
         }
         updates.push((known, transform));
         updates.extend(map.map(|map| map.updated(&seen.best().color, colors)));
         Step { outputs, updates }
+    }
+
+    /// Where the warp as it is moves the pixels `index` along `ray` of the training views, and their centres.
+    fn registered(&self, ray: &Axis, index: &Tensor) -> Registration {
+        let cameras = Cameras::new(&self.frame, ray, index, self.size, &self.intrinsics(), &self.rough_poses());
+        let none = Tensor::scalar(0.0);
+        let code = self.code.as_ref().map_or(&none, |c| &c.tensor);
+        let pinned = self.settings.warp.fix_first;
+        Registration::new(&*self.warp, &cameras.pixels, Some(&cameras.centers), code, pinned)
+    }
+
+    /// The poses of the training views fitted once more, at the pixels [`FIT_PIXELS`], so many of them in every view: an update of
+    /// [`FOUND`], which is the output `found`.
+    pub fn fit(&self, pixels: usize) -> Step {
+        let ray = Axis::new("ray", pixels);
+        let index = Tensor::data(FIT_PIXELS, Shape::new(&[&ray], 1).with_dtype(DType::U32));
+        let transform = self.along_frames(&self.registered(&ray, &index).transform);
+        Step { outputs: vec![("found".into(), transform.clone())], updates: vec![(self.known_poses(), transform)] }
     }
 
     /// Part of a view, `pixels` of them from [`VIEW_FIRST`] on: outputs `color`, `depth` and `opacity`.
@@ -248,8 +267,27 @@ impl RadianceModel {
         let points = Tensor::data(DENSITY_POINTS, Shape::new(&[&Axis::new("place", count)], 3));
         Step { outputs: vec![("density".to_string(), self.rendering.density_at(&points))], updates: vec![] }
     }
+    fn along_frames(&self, transform: &Tensor) -> Tensor {
+        transform.broadcast_to(&Axes::new([self.frame.clone()]))
+    }
+    fn rough_poses(&self) -> Tensor {
+        Tensor::input(POSES, Role::State, Shape::new(&[&self.frame], (3, 4)))
+    }
+    fn known_poses(&self) -> Tensor {
+        Tensor::input(FOUND, Role::State, Shape::new(&[&self.frame], (3, 4)))
+    }
+
+    /// The lenses of the training views.
+    fn intrinsics(&self) -> Tensor {
+        self.lens.corrected(&Tensor::data(INTRINSICS, Shape::new(&[&self.frame], 4)))
+    }
+
+    /// The lens of a rendered view.
+    fn view_intrinsics(&self) -> Tensor {
+        self.lens.corrected(&Tensor::per_step(VIEW_INTRINSICS, Shape::new(&[], 4)))
+    }
     fn view_rays(&self, point: &Axis, index: &Tensor, pose: &Tensor) -> Rays {
-        let cameras = Cameras::new(&self.frame, point, index, self.size, &view_intrinsics(), pose);
+        let cameras = Cameras::new(&self.frame, point, index, self.size, &self.view_intrinsics(), pose);
         Rays::through(&cameras.centers.position, &cameras.pixels.position)
     }
     fn view_range(&self) -> (Tensor, Tensor) {
@@ -268,7 +306,7 @@ impl RadianceModel {
 
     /// What the rays of a rendered view see.
     fn see(&self, rays: &Rays, axes: &Axes, purpose: Purpose) -> Seen {
-        self.rendering.render(rays, &view_intrinsics(), &self.view_range(), axes, purpose)
+        self.rendering.render(rays, &self.view_intrinsics(), &self.view_range(), axes, purpose)
     }
 }
 
@@ -310,9 +348,6 @@ pub fn nothing_found(views: usize) -> Vec<f32> {
 fn view_pose() -> Tensor {
     Tensor::per_step(VIEW_POSE, Shape::new(&[], (3, 4)))
 }
-fn view_intrinsics() -> Tensor {
-    Tensor::per_step(VIEW_INTRINSICS, Shape::new(&[], 4))
-}
 
 /// The number of the step, and which run it belongs to.
 pub(super) fn seeded_step() -> Tensor {
@@ -333,6 +368,7 @@ mod tests {
         let view = View {
             name: "v".into(),
             file: "v.png".into(),
+            file_size: [1, 1],
             pixels,
             transparent: true,
             intrinsics,

@@ -21,6 +21,15 @@ impl ImageSize {
     pub fn pixels(self) -> usize {
         self.height * self.width
     }
+
+    /// Numbers of the pixels in the middles of `side` x `side` equal parts, or of all rows or columns where there are fewer.
+    pub fn grid(self, side: usize) -> Vec<u32> {
+        let middles = |size: usize| {
+            let parts = side.min(size);
+            (0..parts).map(move |i| (2 * i + 1) * size / (2 * parts))
+        };
+        middles(self.height).flat_map(|row| middles(self.width).map(move |c| (row * self.width + c) as u32)).collect()
+    }
 }
 
 /// Pixels and centres of cameras of which rough poses are known.

@@ -18,7 +18,7 @@ use raygrad_compiler::{Axes, Axis, Shape, Tensor};
 /// Streams of the random numbers.
 const JITTER: u32 = 3;
 const DENSITY: u32 = 4;
-const FINE_DENSITY: u32 = 5;
+const FINE_DENSITY: u32 = 7;
 /// Keeps quotients of composited depths finite.
 const NO_OPACITY: f64 = 1e-10;
 

@@ -21,7 +21,7 @@ pub struct Report<'a> {
     pub device: &'a str,
     pub metrics: &'a Metrics,
     /// What is to be said of the numbers.
-    pub note: Option<&'a str>,
+    pub notes: Vec<String>,
     pub pictures: Vec<Picture<'a>>,
     /// Drawings (SVG), after their captions.
     pub drawings: Vec<(&'a str, &'a str)>,
@@ -112,7 +112,7 @@ impl Report<'_> {
         ]);
         let cards =
             cards.iter().map(|(value, what)| format!("<div class=card><b>{value}</b><span>{what}</span></div>"));
-        let note = self.note.map_or(String::new(), |note| format!("<p class=note>Note: {}.</p>", escape(note)));
+        let note: String = self.notes.iter().map(|note| format!("<p class=note>Note: {}.</p>", escape(note))).collect();
         format!("<div class=cards>{}</div>{note}", cards.collect::<String>())
     }
 

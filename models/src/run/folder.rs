@@ -253,6 +253,11 @@ pub fn difference(held: &Settings, wanted: &Settings) -> Option<String> {
         let mut s = s.clone();
         (s.run.device, s.run.threads) = (DeviceChoice::Auto, Count::All);
         (s.run.autotune, s.run.networks) = (false, Networks::Auto);
+        // The same folder seen from elsewhere; what lies in it is compared once it is loaded.
+        let name = s.scene_name();
+        if let Some(scene) = &mut s.scene {
+            scene.path = name;
+        }
         let mut leaves = vec![];
         if let Ok(table) = toml::Table::try_from(&s) {
             for (section, values) in table {

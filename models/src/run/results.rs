@@ -51,7 +51,8 @@ pub fn write_evaluation(
     let below = success_px(grid.height, grid.width);
     cameras.mean.success = cameras.mean.corner_error_px.map(|e| if e < below { 1.0 } else { 0.0 });
     let (scene, method) = (settings.scene_name(), settings.method_name().to_string());
-    let evaluation = evaluation::Evaluation { scene, method, cameras, before: None, after: None, undetermined: false };
+    let (before, after, undetermined, lens) = (None, None, false, None);
+    let evaluation = evaluation::Evaluation { scene, method, cameras, before, after, undetermined, lens };
     folder.write("evaluation.json", evaluation.to_json().as_bytes())?;
     Ok(evaluation)
 }
@@ -109,7 +110,7 @@ pub fn write_results(
         metrics,
         pictures: shown,
         drawings: vec![],
-        note: None,
+        notes: vec![],
         config: &config,
     };
     let report = report.to_html()?;

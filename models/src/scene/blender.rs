@@ -4,7 +4,7 @@
 //! in `transforms.json`. The world stays as it is; depths go from 2 to 6, which fits cameras about 4 away from the origin.
 
 use super::camera::Cameras;
-use super::picture::{DepthFile, image_size};
+use super::picture::{DepthFile, image_size, is_image};
 use super::{DepthRange, Entry, Listing, SceneError, WorldFrame, json};
 use image::metadata::Orientation;
 use serde::Deserialize;
@@ -58,7 +58,7 @@ fn entries(root: &Path, split: &str) -> Result<Vec<Entry>, SceneError> {
     let cameras = Cameras::read(&path)?;
     let entry = |(i, frame): (usize, &Frame)| {
         let mut image = root.join(&frame.file_path);
-        if !image.extension().is_some_and(|e| e == "png" || e == "jpg" || e == "jpeg") {
+        if !is_image(&image) && !image.exists() {
             image.as_mut_os_string().push(".png");
         }
         let size = image_size(&image, (&path, format!("frames[{i}].file_path")))?;

@@ -11,6 +11,7 @@ struct Camera {
     camera_model: Option<String>,
     is_fisheye: Option<bool>,
     camera_angle_x: Option<f64>,
+    camera_angle_y: Option<f64>,
     fl_x: Option<f64>,
     fl_y: Option<f64>,
     cx: Option<f64>,
@@ -75,17 +76,21 @@ impl Cameras<'_> {
             let expected = format!("the size of the image, {height} x {width}, or that resized");
             return refuse("w", w_own, &expected, format!("h x w of {h} x {w}"));
         }
-        let (angle, angle_own) = either(&|c| c.camera_angle_x);
-        if let Some(angle) = angle.filter(|a| !(*a > 0.0 && *a < std::f64::consts::PI)) {
-            return refuse("camera_angle_x", angle_own, "an angle in radians between 0 and pi", angle.to_string());
+        let angles = [either(&|c| c.camera_angle_x), either(&|c| c.camera_angle_y)];
+        for (field, (angle, own)) in ["camera_angle_x", "camera_angle_y"].into_iter().zip(angles) {
+            if let Some(angle) = angle.filter(|a| !(*a > 0.0 && *a < std::f64::consts::PI)) {
+                return refuse(field, own, "an angle in radians between 0 and pi", angle.to_string());
+            }
         }
-        let by_angle = angle.map(|a| 0.5 * w / (0.5 * a).tan());
+        let focal = |(angle, _): (Option<f64>, bool), size: f64| angle.map(|a| 0.5 * size / (0.5 * a).tan());
+        let (by_angle, by_angle_y) = (focal(angles[0], w), focal(angles[1], h));
         let ((fl_x, x_own), (fl_y, y_own)) = (either(&|c| c.fl_x), either(&|c| c.fl_y));
         let Some(fx) = fl_x.or(by_angle) else {
             return refuse("fl_x", false, "a focal length in pixels, or `camera_angle_x`", "neither".into());
         };
-        let fy = fl_y.unwrap_or(fx);
-        let name = if fl_x.is_some() { ("fl_x", x_own) } else { ("camera_angle_x", angle_own) };
+        // Focal lengths in pixels win over angles, on both axes.
+        let fy = fl_y.or(by_angle_y.filter(|_| fl_x.is_none())).unwrap_or(fx);
+        let name = if fl_x.is_some() { ("fl_x", x_own) } else { ("camera_angle_x", angles[0].1) };
         for ((field, own), value) in [(name, fx), (("fl_y", y_own), fy)] {
             if !(value > 0.0 && value < 1e9) {
                 return refuse(field, own, "a positive focal length below 1e9 pixels", value.to_string());

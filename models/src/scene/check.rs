@@ -1,12 +1,13 @@
 //! What every layout refuses.
 
-use super::{DepthRange, Entry, Pose, SceneError};
+use super::{DepthRange, Entry, Intrinsics, Pose, SceneError};
+use std::collections::HashMap;
 use std::path::Path;
 
 /// Images of which some are set aside must be at least so many.
 const LEAST_TO_SPLIT: usize = 10;
 /// Nothing is farther from the origin of a file's world.
-const FARTHEST: f64 = 1e15;
+pub(super) const FARTHEST: f64 = 1e15;
 
 pub(super) fn check_depth(depth: DepthRange, from: &str) -> Result<(), SceneError> {
     let (near, far) = match depth {
@@ -33,6 +34,39 @@ pub(super) fn check_sizes(entries: &[&Entry], resized: bool) -> Result<(), Scene
         }
     }
     Ok(())
+}
+
+/// Refuses a list of views in which two are the same image.
+pub(super) fn check_distinct(entries: &[Entry], root: &Path) -> Result<(), SceneError> {
+    let mut known: HashMap<&Path, &str> = HashMap::new();
+    for entry in entries {
+        if let Some(first) = known.insert(&entry.image, &entry.name) {
+            let message = format!("{} is there twice: views `{first}` and `{}`", entry.image.display(), entry.name);
+            return Err(SceneError::Format { path: root.into(), message });
+        }
+    }
+    Ok(())
+}
+
+/// The camera for an image of a size, which must be of the shape that the file speaks of.
+pub(super) fn resized(
+    camera: &Intrinsics,
+    [height, width]: [usize; 2],
+    path: &Path,
+    field: impl Fn() -> String,
+) -> Result<Intrinsics, SceneError> {
+    let refuse =
+        |expected: String, found: String| Err(SceneError::Field { path: path.into(), field: field(), expected, found });
+    if !same_shape([camera.height, camera.width], [height, width]) {
+        let found = format!("one for {} x {}", camera.height, camera.width);
+        return refuse(format!("a camera for images of {height} x {width} pixels, or those resized"), found);
+    }
+    let within = |c: f64, size: usize| c > 0.0 && c < size as f64;
+    if !(within(camera.cx, camera.width) && within(camera.cy, camera.height)) {
+        let found = format!("({}, {}) of {} x {}", camera.cx, camera.cy, camera.width, camera.height);
+        return refuse("a principal point inside the image".into(), found);
+    }
+    Ok(camera.resized(height, width))
 }
 
 /// Whether one image can be the other one resized, sides being whole pixels.

@@ -5,6 +5,7 @@
 //! see `normalise`, with depths from the points that the images see; they are inverse, from 3/4 of the nearest on. Every
 //! eighth image in the order of names is for testing, from the first on.
 
+use super::check::resized;
 use super::normalise::normalise;
 use super::picture::image_size;
 use super::{DepthRange, Entry, Intrinsics, Listing, Pose, SceneError, check_pose, enough_to_split, every};
@@ -74,8 +75,9 @@ pub(super) fn list(root: &Path) -> Result<Listing, SceneError> {
         };
         let pose = check_pose(image.pose, &images_file, || field.clone())?;
         let path = root.join("images").join(&image.name);
-        let [height, width] = image_size(&path, (&images_file, field))?;
-        let intrinsics = camera.resized(height, width);
+        let size = image_size(&path, (&images_file, field))?;
+        let intrinsics =
+            resized(camera, size, &images_file, || format!("camera {} of image {}", image.camera, image.name))?;
         let name = image.name.clone();
         entries.push(Entry {
             name,

@@ -117,7 +117,7 @@ pub(super) fn list(root: &Path, options: &LoadOptions) -> Result<Listing, SceneE
         let (k, pose) = decompose(&matrix(field.clone())?.values, &path, &field)?;
         let [height, width] = image_size(&image, (&path, field.clone()))?;
         let (cx, cy) = (k[(0, 2)], k[(1, 2)]);
-        let central = |c: f64, size: usize| (0.25..=0.75).contains(&(c / size as f64));
+        let central = |c: f64, size: usize| (0.4..=0.6).contains(&(c / size as f64));
         if !(central(cx, width) && central(cy, height)) {
             let name = file_name(&image);
             return Err(SceneError::Field {

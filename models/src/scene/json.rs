@@ -7,7 +7,7 @@ use std::path::Path;
 
 pub(super) fn read<T: DeserializeOwned>(path: &Path) -> Result<T, SceneError> {
     let text = std::fs::read_to_string(path).map_err(|source| SceneError::Read { path: path.into(), source })?;
-    let mut json = serde_json::Deserializer::from_str(&text);
+    let mut json = serde_json::Deserializer::from_str(text.strip_prefix('\u{feff}').unwrap_or(&text));
     serde_path_to_error::deserialize(&mut json).map_err(|e| {
         let message = match e.path().to_string() {
             field if field == "." => e.inner().to_string(),

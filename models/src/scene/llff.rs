@@ -5,6 +5,7 @@
 //! that the average camera is the identity; depths are then inverse, from 1 on. Rows are in the plain order of the images'
 //! names: 10.png before 2.png. The last tenth is for testing.
 
+use super::check::resized;
 use super::frame::nearest_rotation;
 use super::json::{FLIP, opengl};
 use super::numpy::{self, NumpyArray};
@@ -35,8 +36,9 @@ pub(super) fn list(root: &Path, options: &LoadOptions) -> Result<Listing, SceneE
     let frame = recentring(&cameras, options.published_rotations);
     let mut entries = vec![];
     for (i, (image, pose)) in images.into_iter().zip(&cameras.poses).enumerate() {
-        let [height, width] = image_size(&image, (&path, format!("row {i}")))?;
-        let intrinsics = cameras.intrinsics.resized(height, width);
+        let size = image_size(&image, (&path, format!("row {i}")))?;
+        let camera = || format!("row {i}, height and width for {}", file_name(&image));
+        let intrinsics = resized(&cameras.intrinsics, size, &path, camera)?;
         entries.push(Entry {
             name: file_name(&image),
             image,

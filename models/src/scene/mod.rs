@@ -33,7 +33,7 @@ pub use named_poses::{NamedPoses, World};
 pub use noise::{InitialPoses, NoiseError, PoseStart};
 
 use crate::geometry::Pose;
-use check::{check_depth, check_pose, check_sizes, enough_to_split};
+use check::{check_depth, check_distinct, check_pose, check_sizes, enough_to_split};
 use image::metadata::Orientation;
 use picture::{DepthFile, read_view};
 use rayon::prelude::*;
@@ -71,6 +71,8 @@ pub struct View {
     pub name: String,
     /// Its file.
     pub file: PathBuf,
+    /// Height and width of the image in it, upright.
+    pub file_size: [usize; 2],
     /// Red, green, blue and opacity of every pixel, row by row.
     pub pixels: Vec<[u8; 4]>,
     /// Whether the image can be transparent.
@@ -290,6 +292,8 @@ pub fn load(root: &Path, options: &LoadOptions, progress: &(dyn Fn(usize, usize)
         Layout::Colmap => colmap::list(root),
         Layout::Folder => folder::list(root, options),
     }?;
+    check_distinct(&listing.train, root)?;
+    check_distinct(&listing.test, root)?;
     let limit = |entries: &mut Vec<Entry>, n: Option<usize>| entries.truncate(n.unwrap_or(usize::MAX));
     limit(&mut listing.train, options.train_limit);
     if options.no_train_depths {

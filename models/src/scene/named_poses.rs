@@ -49,6 +49,10 @@ impl NamedPoses {
             let poses = colmap::poses(path)?;
             return Ok(Some(NamedPoses { poses, world: World::Other }));
         }
+        if path.extension().is_some_and(|e| e == "bin" || e == "txt" || e == "npy") {
+            let message = "expected a JSON file of poses, or the folder of a COLMAP model".to_string();
+            return Err(SceneError::Format { path: path.into(), message });
+        }
         let keys: serde_json::Map<String, serde_json::Value> = json::read(path)?;
         if keys.contains_key("frames") {
             let file: Frames = json::read(path)?;
@@ -74,17 +78,23 @@ impl NamedPoses {
         Ok(None)
     }
 
-    /// A pose, or nothing, for each of these views. Endings of names do not count, nor do folders where the rest is unique.
+    /// A pose, or nothing, for each of these views. Endings of names do not count, nor do folders that one of two names lacks, where
+    /// the rest is unique.
     ///
     /// # Errors
     /// If no view has a pose.
     pub fn of_views(&self, path: &Path, views: &[&str]) -> Result<Vec<Option<Pose>>, NoiseError> {
         let whole: HashMap<&str, Pose> = self.poses.iter().map(|(name, pose)| (without_ending(name), *pose)).collect();
-        let mut short: HashMap<&str, Option<Pose>> = HashMap::new();
+        let mut short: HashMap<&str, Option<(&str, Pose)>> = HashMap::new();
         for (name, pose) in &self.poses {
-            short.entry(last(name)).and_modify(|p| *p = None).or_insert(Some(*pose));
+            short.entry(last(name)).and_modify(|p| *p = None).or_insert(Some((without_ending(name), *pose)));
         }
-        let of = |view: &&str| whole.get(without_ending(view)).copied().or_else(|| *short.get(last(view))?);
+        let alike = |view: &str| {
+            let (view, (name, pose)) = (without_ending(view), (*short.get(last(view))?)?);
+            let is_end = |of: &str, end: &str| of.strip_suffix(end).is_some_and(|rest| rest.ends_with(['/', '\\']));
+            (is_end(view, name) || is_end(name, view)).then_some(pose)
+        };
+        let of = |view: &&str| whole.get(without_ending(view)).copied().or_else(|| alike(view));
         let found: Vec<Option<Pose>> = views.iter().map(of).collect();
         if found.iter().all(Option::is_none) {
             let name = |n: Option<&str>| n.map_or("nothing".to_string(), |n| format!("`{n}`"));

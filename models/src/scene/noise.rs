@@ -5,6 +5,7 @@
 //! reproduces it elsewhere; its poses are of the loaded world ([`super::WorldFrame`]). Poses of other programs are
 //! [`super::NamedPoses`].
 
+use super::check::FARTHEST;
 use crate::data::Random;
 use crate::geometry::Pose;
 use serde::{Deserialize, Serialize};
@@ -162,9 +163,10 @@ impl PoseStart {
                 return Err(NoiseError::Count { path: path.into(), list, found, expected });
             }
             let poses: Vec<Pose> = rows.iter().map(|r| Pose::from_rows(r)).collect();
-            match poses.iter().position(|p| p.rigidity_error() > 1e-3) {
+            let far = |p: &Pose| p.translation.iter().any(|x| x.abs() > FARTHEST);
+            match poses.iter().position(|p| p.rigidity_error() > 1e-3 || far(p)) {
                 Some(i) => {
-                    Err(format(format!("`{list}[{i}]`: expected a rotation and a translation of finite numbers")))
+                    Err(format(format!("`{list}[{i}]`: expected a rotation and a translation of numbers below 1e15")))
                 }
                 None => Ok(poses),
             }

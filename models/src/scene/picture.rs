@@ -37,13 +37,20 @@ pub(super) fn upright(path: &Path) -> Result<([usize; 2], Orientation), SceneErr
 }
 
 /// The images of a folder, in the plain order of their names.
+/// Whether a file is called like an image.
+pub(super) fn is_image(path: &Path) -> bool {
+    let ending = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
+    ["png", "jpg", "jpeg"].contains(&ending.as_str())
+}
+
 pub(super) fn images_in(folder: &Path) -> Result<Vec<PathBuf>, SceneError> {
     let refuse = |source| SceneError::Read { path: folder.into(), source };
     let mut found = vec![];
     for file in std::fs::read_dir(folder).map_err(refuse)? {
         let path = file.map_err(refuse)?.path();
-        let extension = path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase();
-        if ["png", "jpg", "jpeg"].contains(&extension.as_str()) && path.is_file() {
+        // What macOS leaves beside files, and other hidden ones, are no images.
+        let hidden = path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.'));
+        if is_image(&path) && !hidden && path.is_file() {
             found.push(path);
         }
     }
@@ -119,6 +126,7 @@ pub(super) fn read_view(entry: &Entry, frame: &WorldFrame, options: &LoadOptions
     Ok(View {
         name: entry.name.clone(),
         file: entry.image.clone(),
+        file_size: [native.height, native.width],
         removed_distortion,
         pixels,
         transparent,

@@ -7,7 +7,7 @@
 
 use super::camera::Cameras;
 use super::normalise::normalise;
-use super::picture::{DepthFile, image_size};
+use super::picture::{DepthFile, image_size, is_image};
 use super::{DepthRange, Entry, Listing, SceneError, enough_to_split, every, json};
 use image::metadata::Orientation;
 use serde::Deserialize;
@@ -48,7 +48,7 @@ pub(super) fn list(root: &Path) -> Result<Listing, SceneError> {
     let mut entries = vec![];
     for (i, frame) in file.frames.iter().enumerate() {
         let mut image = root.join(&frame.file_path);
-        if image.extension().is_none() {
+        if !is_image(&image) && !image.exists() {
             image.as_mut_os_string().push(".png");
         }
         let size = image_size(&image, (&path, format!("frames[{i}].file_path")))?;

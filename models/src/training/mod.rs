@@ -80,6 +80,11 @@ pub trait Training {
     /// Times parts of an evaluation. Parameters and states may change.
     fn trial(&mut self) -> Result<Trial, Error>;
 
+    /// What had to be assumed of the data, a sentence each.
+    fn notes(&self) -> &[String] {
+        &[]
+    }
+
     /// The headline numbers as lines of text.
     fn summary(&self, last: &Final) -> String;
 

@@ -88,7 +88,7 @@ pub trait Warp: Debug + Send + Sync {
     }
 
     /// A term that the warp adds to the loss, given the field points of its map, and the term's weight. Of one that has axes or
-    /// channels the mean is taken.
+    /// channels the mean is taken, and in space that of pixels and centres.
     fn penalty(&self, _at: &Points, _code: &Tensor, _mapped: &Tensor) -> Option<(Tensor, f64)> {
         None
     }
@@ -163,7 +163,14 @@ impl Registration {
         };
         let (local, mapped_centers) = (map(at), centers.map(map));
         let mean = |p: Tensor| if p.shape().lanes() == 1 { p } else { p.mean_all() };
-        let penalty = warp.penalty(at, code, &local).map(|(p, weight)| (mean(p), weight));
+        let penalty = |at: &Points, mapped| warp.penalty(at, code, mapped).map(|(p, weight)| (mean(p), weight));
+        let penalty = match (penalty(at, &local), centers.zip(mapped_centers.as_ref())) {
+            (Some((of_pixels, weight)), Some((at, mapped))) => {
+                let of_centers = penalty(at, mapped).map_or(of_pixels.clone(), |(p, _)| p);
+                Some(((of_pixels + of_centers) * 0.5, weight))
+            }
+            (penalty, _) => penalty,
+        };
         if let Some(transform) = warp.global(&at.frame, code) {
             let transform = if held { first.select(&neutral(warp.dof()), &transform) } else { transform };
             let global = local.clone();

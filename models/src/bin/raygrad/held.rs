@@ -17,6 +17,9 @@ pub struct HeldRun {
     /// Threads of the CPU backend. Results do not depend on them.
     #[arg(long, value_name = "N")]
     threads: Option<String>,
+    /// Fit the poses once more, on a grid of N x N pixels of every view (0: take those of the last step).
+    #[arg(long, value_name = "N")]
+    fit_grid: Option<String>,
 }
 
 impl HeldRun {
@@ -27,6 +30,7 @@ impl HeldRun {
             ("--data", "scene.path", &self.data),
             ("--device", "run.device", &self.device),
             ("--threads", "run.threads", &self.threads),
+            ("--fit-grid", "train.fit_grid", &self.fit_grid),
         ];
         crate::set_options(&mut experiment, &options)?;
         Ok(experiment)

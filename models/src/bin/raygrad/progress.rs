@@ -26,6 +26,14 @@ impl Progress {
         Progress { bar, begun: Instant::now(), last_line: None, first: 0, done: 0, steps: 0 }
     }
 
+    /// A line for people, above the bar if there is one.
+    fn say(&self, text: &str) {
+        match &self.bar {
+            Some(bar) => bar.println(text),
+            None => eprintln!("{text}"),
+        }
+    }
+
     /// Steps a second in this part of the run.
     fn rate(&self) -> f64 {
         (self.done - self.first) as f64 / self.begun.elapsed().as_secs_f64().max(1e-3)
@@ -51,13 +59,14 @@ impl Observer for Progress {
         })
     }
 
+    fn note(&mut self, note: &str) {
+        self.say(&format!("note: {note}"));
+    }
+
     fn expected(&mut self, estimate: &Estimate, device: &str) {
         let [total, training, evaluation] = [estimate.total(), estimate.training, estimate.evaluation].map(duration);
         let text = format!("about {total} on {device}: {training} of training, {evaluation} of evaluation");
-        match &self.bar {
-            Some(bar) => bar.println(text),
-            None => eprintln!("{text}"),
-        }
+        self.say(&text);
     }
 
     fn begin(&mut self, folder: &Path, done: usize, steps: usize) {

@@ -1,0 +1,53 @@
+//! Lenses that are trained with the poses.
+//!
+//! All views have the same corrections of the lenses that were given, since one camera took them: with a, b, u, v trained,
+//!
+//! ```text
+//! fx' = fx exp(a)    fy' = fy exp(b)    cx' = cx + u fx    cy' = cy + v fy
+//! ```
+//!
+//! where only focal lengths are refined, a = b and u = v = 0. They learn at the warp's rate.
+
+use crate::config::RefineLens;
+use crate::evaluation::FoundLens;
+use raygrad_compiler::functions::mlp::{Init, Parameter};
+use raygrad_compiler::ops::pick::concat;
+use raygrad_compiler::{Shape, Tensor};
+
+/// The parameter: `[] x 1` (a) or `[] x 4` (a, b, u, v).
+pub const LENS: &str = "camera.lens";
+
+/// What is trained of the lenses.
+#[derive(Clone, Debug)]
+pub struct Lens {
+    pub correction: Option<Parameter>,
+}
+
+impl Lens {
+    pub fn new(refined: RefineLens) -> Lens {
+        let of = |width| Parameter::new(LENS, Shape::new(&[], width), Init::Zero);
+        let correction = match refined {
+            RefineLens::None => None,
+            RefineLens::Focal => Some(of(1)),
+            RefineLens::All => Some(of(4)),
+        };
+        Lens { correction }
+    }
+
+    /// The lenses as they are now, fx, fy, cx and cy like the given ones.
+    pub fn corrected(&self, given: &Tensor) -> Tensor {
+        let Some(correction) = self.correction.as_ref().map(|p| &p.tensor) else { return given.clone() };
+        let (focal, center) = (given.slice(0..2), given.slice(2..4));
+        if correction.width() == 1 {
+            return concat([&(focal * correction.exp()), &center]);
+        }
+        concat([&(&focal * correction.slice(0..2).exp()), &(center + correction.slice(2..4) * focal)])
+    }
+}
+
+/// What the values of [`LENS`] say.
+pub fn found(correction: &[f32]) -> FoundLens {
+    let x = |i: usize| correction.get(i).copied().map_or(0.0, f64::from);
+    let [a, b] = if correction.len() == 1 { [x(0); 2] } else { [x(0), x(1)] };
+    FoundLens { focal_scale: [a.exp(), b.exp()], principal_shift: [x(2), x(3)] }
+}
