@@ -333,7 +333,7 @@ impl Experiment {
                 observer.measured(&entry);
                 run.metrics.steps.push(entry);
             }
-            if due(every.picture_every, done) {
+            if due(every.picture_every, done) || (done == steps && every.picture_every > 0) {
                 trainer.write_frame(folder)?;
             }
             if due(every.checkpoint_every, done) || done == steps {

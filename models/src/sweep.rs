@@ -44,9 +44,10 @@ impl SweepCell {
         }
     }
 
-    /// What was measured, under the name of the preset.
+    /// What was measured, under the name of the preset, and of the scene as the sweep has it.
     fn named(&self, evaluation: &Evaluation) -> Evaluation {
-        Evaluation { method: self.preset.clone(), ..evaluation.clone() }
+        let (method, scene) = (self.preset.clone(), self.layered.settings.scene_name());
+        Evaluation { method, scene, ..evaluation.clone() }
     }
 
     /// What the papers say of the same scene, method and start.

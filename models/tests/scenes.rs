@@ -188,6 +188,13 @@ fn a_colmap_model_in_text() {
     assert_eq!(scene.train[1].name, "r_10.png");
     assert!((0..3).all(|r| (back[r] - expected(r)).abs() < 1e-9), "{back}");
 
+    for (camera, part) in
+        [("3 PINHOLE 24 30 33 33 12 12", "12 x 12"), ("3 PINHOLE 24 24 33 33 12 30", "principal point")]
+    {
+        std::fs::write(sparse.join("cameras.txt"), camera).unwrap();
+        made.refused(&options, &["images.txt", "camera 3 of image r_0.png", part]);
+    }
+    std::fs::write(sparse.join("cameras.txt"), "3 PINHOLE 24 24 33 33 12 12\n").unwrap();
     std::fs::write(sparse.join("images.txt"), images.replacen("3 r_4.png", "9 r_4.png", 1)).unwrap();
     made.refused(&options, &["images.txt", "image r_4.png", "found 9"]);
     std::fs::write(sparse.join("cameras.txt"), "3 FISHEYE 24 24 33.4 12 12 0\n").unwrap();

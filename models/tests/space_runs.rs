@@ -1,5 +1,6 @@
 //! Runs in space from start to end, on the built-in scene at a size for a test.
 
+use raygrad::geometry::Pose;
 use raygrad::run::{Entry, RunFolder};
 use raygrad::training::{Training, Watch};
 use raygrad::{Error, Experiment, Observer, Quiet, Trial};
@@ -92,6 +93,61 @@ fn searches_that_find_no_lost_camera_leave_a_run_as_it_is() {
         std::fs::read(run.join(format!("checkpoint-{STEPS:07}.safetensors"))).unwrap()
     };
     assert!(bits(0) == bits(3));
+}
+
+/// What was found of the lenses is told and exported, and a resumed run goes on from it.
+#[test]
+fn refined_lenses_are_told_and_exported() {
+    let dir = tempfile::tempdir().unwrap();
+    let of = |refined: &str| {
+        let run = dir.path().join(refined);
+        let outcome = tiny(&[&format!("train.refine_lens={refined}"), "optim.warmup_pose=0"], &run).train().unwrap();
+        let mut explorer = Experiment::of_run(&run).unwrap().restored_explorer().unwrap();
+        let (found, given) = (explorer.found_lens().unwrap(), explorer.data.scene.train[0].intrinsics.clone());
+        let evaluation: Value = serde_json::from_slice(&std::fs::read(run.join("evaluation.json")).unwrap()).unwrap();
+        (found, given, explorer.cameras().unwrap().remove(0), evaluation["lens"].clone(), outcome.summary)
+    };
+    let (found, given, exported, told, summary) = of("all");
+    let found = found.unwrap();
+    assert!(found.focal_scale[0] != found.focal_scale[1] && found.principal_shift[0] != 0.0, "{found:?}");
+    assert_eq!(told, serde_json::to_value(found).unwrap());
+    let lens = found.of(&given);
+    assert_eq!((exported.focal, exported.principal), ([lens.fx, lens.fy], [lens.cx, lens.cy]));
+    assert!((lens.fx / given.fx - found.focal_scale[0]).abs() < 1e-12 && lens.cy > given.cy - given.fy);
+    assert!(summary.contains("lenses were refined: focal lengths x"), "{summary}");
+    let report = std::fs::read_to_string(dir.path().join("all/report.html")).unwrap();
+    assert!(report.contains("lenses were refined") && report.contains("PSNR (dB), test views, refined"));
+    let found = of("focal").0.unwrap();
+    assert!(found.focal_scale[0] == found.focal_scale[1] && found.principal_shift == [0.0; 2]);
+    let (none, given, exported, told, _) = of("none");
+    assert!(none.is_none() && told.is_null() && exported.focal[0] == given.fx);
+}
+
+/// Poses of the last step hang on the pixels that it drew, those of a grid do not.
+#[test]
+fn poses_are_fitted_on_a_grid() {
+    let dir = tempfile::tempdir().unwrap();
+    let of = |method: &str, side: usize| {
+        let run = dir.path().join(method);
+        if !run.exists() {
+            tiny(&[&format!("warp.method={method}"), "train.relocalise_every=0"], &run).train().unwrap();
+        }
+        let experiment = Experiment::of_run(&run).unwrap().set(&format!("train.fit_grid={side}")).unwrap();
+        let mut explorer = experiment.restored_explorer().unwrap();
+        let poses = explorer.poses().unwrap();
+        explorer.settle().unwrap();
+        assert_eq!(explorer.poses().unwrap(), poses);
+        poses
+    };
+    let apart = |a: &[Pose], b: &[Pose]| {
+        let one = |(a, b): (&Pose, &Pose)| (a.rotation - b.rotation).norm() + (a.translation - b.translation).norm();
+        a.iter().zip(b).map(one).fold(0.0, f64::max)
+    };
+    let (drawn, all, more) = (of("local", 0), of("local", 16), of("local", 99));
+    assert!(apart(&drawn, &all) > 1e-6 && all == more, "{drawn:?} {all:?}");
+    // One motion a view is the same at all pixels; the last step's is of the step before its update.
+    let (drawn, some, all) = (of("global", 0), of("global", 2), of("global", 16));
+    assert!(some == all && apart(&drawn, &all) < 0.05);
 }
 
 #[test]

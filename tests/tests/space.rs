@@ -3,7 +3,7 @@
 use raygrad::config::Layered;
 use raygrad::geometry::Pose;
 use raygrad::radiance::RadianceModel;
-use raygrad::radiance::model::{FOUND, INTRINSICS, POSES, nothing_found};
+use raygrad::radiance::model::{FIT_PIXELS, FOUND, INTRINSICS, POSES, nothing_found};
 use raygrad::radiance::rays::ImageSize;
 use raygrad::training::Rates;
 use raygrad::warps;
@@ -199,6 +199,30 @@ fn local_motions() {
 }
 
 #[test]
+fn refined_lenses() {
+    check_model("l2g-llff", &["train.refine_lens=all"]);
+    check_model("nerf-blender", &["train.refine_lens=focal", "train.fine_samples=4"]);
+    check_model(
+        "barf-llff",
+        &["train.refine_lens=all", "train.ndc=true", "train.depth=metric", "train.range=[0.0, 1.0]"],
+    );
+}
+
+/// The step that fits poses once more, on every device.
+#[test]
+fn poses_fitted_once_more() {
+    for (preset, set) in [("l2g-blender", &["train.refine_lens=focal"][..]), ("inn-llff", &[]), ("barf-blender", &[])] {
+        let model = model(preset, set);
+        let step = model.fit(9);
+        let mut bound = bind(&model, &step.roots(), &mut Rng(seed(preset)));
+        if let Some(pixels) = bound.get_mut(FIT_PIXELS) {
+            *pixels = Array::integers(&pixels.shape, SIZE.grid(3));
+        }
+        check(&devices_for_large_programs(), &step, &bound).unwrap_or_else(|e| panic!("{preset}: {e}"));
+    }
+}
+
+#[test]
 fn invertible_warps() {
     // With the paper's weight, 1e4, second derivatives are differences of numbers too large for the tolerances. All
     // derivatives are linear in the weight, so what holds at 100 holds there.
@@ -294,7 +318,7 @@ fn a_gpu_can_run_every_kind_of_field() {
     use raygrad_kernels::gpu::{Inputs, Limits, lower};
     for (preset, set) in [("nerf-blender-repr", &[][..]), ("nerf-llff-repr", &[]), ("garf-llff-se3", &[])] {
         let model = model(preset, set);
-        for step in [model.train_step(), model.view(16), model.refinement(), model.density(16)] {
+        for step in [model.train_step(), model.view(16), model.refinement(), model.density(16), model.fit(16)] {
             let program = compile(&step, &Target::gpu()).unwrap_or_else(|e| panic!("{preset}: {e}"));
             let lowered = lower(&program, &mut Inputs::default(), &Limits::default());
             let lowered = lowered.unwrap_or_else(|e| panic!("{preset}: {e}\n{program}"));

@@ -34,7 +34,7 @@ struct Setting {
 
 /// Where a value holds.
 #[derive(Clone, Debug, PartialEq, Eq)]
-enum When {
+pub(super) enum When {
     Always,
     /// The scene is a capture.
     Capture,
@@ -53,7 +53,7 @@ const SCENE: [&str; 3] = ["scene.path", "scene.layout", "data.image"];
 
 impl When {
     /// The condition in front of a key of a file, and the key.
-    fn split(key: &str) -> (When, &str) {
+    pub(super) fn split(key: &str) -> (When, &str) {
         if let Some(key) = key.strip_prefix("captures.") {
             return (When::Capture, key);
         }

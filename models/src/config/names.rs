@@ -43,7 +43,7 @@ impl Settings {
         let name = part(Path::new(path)).map(|n| n.to_string_lossy().into_owned()).or_else(whole);
         let name = name.unwrap_or_else(|| path.into());
         match name.rsplit_once('_') {
-            Some((_, scan)) if scan.starts_with("scan") => scan.to_string(),
+            Some((_, scan)) if is_scan(scan) => scan.to_string(),
             _ => name,
         }
     }
@@ -55,7 +55,8 @@ impl Settings {
         match of_scene {
             None if self.warp.method == Method::None => None,
             None => Some(format!("homography {}, translation {}", noise.homography, noise.translation)),
-            Some(("truth", _)) => None,
+            Some(("truth", _)) if self.warp.method == Method::None => None,
+            Some(("truth", _)) => Some("truth".to_string()),
             Some(("identity", _)) => Some("identity".to_string()),
             Some(("noisy", NoiseKind::Barf)) => Some(format!("noise {}", noise.rotation)),
             Some(("noisy", NoiseKind::L2g)) if self.has_noise_of_scene() => Some("noise per scene".to_string()),
@@ -74,6 +75,11 @@ impl Settings {
         });
         of_paper.is_ok_and(|noise| noise == self.noise)
     }
+}
+
+/// `scan24`.
+fn is_scan(name: &str) -> bool {
+    name.strip_prefix("scan").is_some_and(|n| !n.is_empty() && n.chars().all(|c| c.is_ascii_digit()))
 }
 
 impl SceneSettings {
@@ -127,6 +133,14 @@ mod tests {
         assert_eq!(fixed.settings.method_name(), "fixed");
         assert_eq!(scene("barf-blender", "scene.path=data/lego/"), "lego");
         assert_eq!(scene("inn-dtu", "scene.path=data/dtu_scan24"), "scan24");
+        assert_eq!(scene("inn-dtu", "scene.path=kitchen_scan"), "kitchen_scan");
         assert_eq!(scene("planar-barf", "data.image=photos/cat.jpg"), "cat");
+        let here = std::env::current_dir().unwrap();
+        let here = here.file_name().unwrap().to_string_lossy();
+        assert_eq!(scene("barf-blender", "scene.path=."), here);
+        assert_eq!(scene("barf-blender", "scene.path=src/.."), here);
+        let mut known = Layered::load("barf-blender").unwrap();
+        known.set("scene.poses=truth").unwrap();
+        assert_eq!(known.settings.start_name().as_deref(), Some("truth"));
     }
 }

@@ -12,7 +12,7 @@
 //! ```
 
 use super::error::{ConfigError, Origin};
-use super::layers::{Layered, nearest, unknown};
+use super::layers::{Layered, When, nearest, unknown};
 use super::leaves::{Leaf, leaves};
 use crate::scene::Layout;
 use std::path::Path;
@@ -48,14 +48,18 @@ impl Sweep {
         let file = path.to_string_lossy();
         let (lists, mut rest): (Vec<Leaf>, Vec<Leaf>) =
             leaves(&file, &text)?.into_iter().partition(|l| LISTS.contains(&l.key.as_str()));
-        // What is set for one preset wins over what is set for all.
-        rest.sort_by_key(|l| !l.key.starts_with("set."));
         let list = |key: &str| lists.iter().find(|l| l.key == key);
         let Some(presets) = list("presets") else {
             return Err(ConfigError::MissingOfSweep { file: file.into() });
         };
         let bases = bases(presets)?;
         let names: Vec<&str> = bases.iter().map(|b| b.name.as_str()).collect();
+        // What is set for one preset wins over what is set for all, and of either what holds for some scenes over what holds for all.
+        rest.sort_by_key(|l| {
+            let of_preset = |name: &&str| l.key.strip_prefix("preset.")?.strip_prefix(name)?.strip_prefix('.');
+            let key = l.key.strip_prefix("set.").or_else(|| names.iter().find_map(of_preset)).unwrap_or_default();
+            (!l.key.starts_with("set."), When::split(key).0 != When::Always)
+        });
         let of_preset = |layered: Layered| rest.iter().try_fold(layered, |l, leaf| set(l, leaf, &names));
         let bases = bases.iter().cloned().map(of_preset).collect::<Result<Vec<Layered>, _>>()?;
         let scenes = values(list("scenes"), "the names of folders or photos", Value::is_str)?;
@@ -210,6 +214,21 @@ mod tests {
         let alone = load("presets = [\"planar-l2g-small\"]\n").unwrap();
         assert_eq!(alone.cells.iter().map(|c| c.name.as_str()).collect::<Vec<_>>(), ["builtin-planar-l2g-small-s0"]);
         assert!(!alone.is_in_space());
+    }
+
+    /// What holds for some scenes wins over what holds for all, in whatever order they stand, and a preset over all.
+    #[test]
+    fn settings_for_some_scenes_win() {
+        let steps = |rest: &str| {
+            let text = format!("presets = [\"barf-small\", \"l2g-small\"]\nscenes = [\"builtin\"]\n{rest}");
+            load(&text).unwrap().cells.iter().map(|c| c.layered.settings.optim.steps).collect::<Vec<_>>()
+        };
+        let (all, some) = ("[set.optim]\nsteps = 30\n", "[set.on.builtin.optim]\nsteps = 20\n");
+        assert_eq!(steps(&format!("{all}{some}")), [20, 20]);
+        assert_eq!(steps(&format!("{some}{all}[set.on.fern.optim]\nsteps = 7\n")), [20, 20]);
+        let one = "[preset.l2g-small.optim]\nsteps = 10\n";
+        assert_eq!(steps(&format!("{one}{some}{all}")), [20, 10]);
+        assert_eq!(steps(&format!("[preset.l2g-small.on.builtin.optim]\nsteps = 9\n{one}{all}")), [30, 9]);
     }
 
     #[test]

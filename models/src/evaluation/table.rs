@@ -45,7 +45,7 @@ pub struct Row {
     pub verified: bool,
     /// One for each of [`Table::scenes`].
     pub values: Vec<Option<Cell>>,
-    /// Over the scenes that have a value; of a paper that only has means, its mean.
+    /// Over all of these, nothing where one has no value; of a paper that only has means, its mean.
     pub mean: Option<Cell>,
 }
 
@@ -116,9 +116,30 @@ impl Table {
             let value = |run: &Evaluation| stage.map_or(Some(&run.cameras), |s| run.stage(s))?.mean.get(metric);
             Cell::of(&runs.filter_map(value).collect::<Vec<f64>>())
         };
-        let values: Vec<Option<Cell>> = scenes.iter().map(cell).collect();
-        let mean = mean(&values)?;
-        Some(Row { metric, stage, method: method.into(), source: None, verified: true, values, mean: Some(mean) })
+        let mut values: Vec<Option<Cell>> = scenes.iter().map(cell).collect();
+        // Whether a run succeeds has a share, and no spread.
+        if metric == Metric::Success {
+            values.iter_mut().flatten().for_each(|c| c.spread = None);
+        }
+        let (mean, method) = (mean(&values), method.into());
+        let known = values.iter().any(Option::is_some);
+        known.then_some(Row { metric, stage, method, source: None, verified: true, values, mean })
+    }
+
+    /// How many runs there are of a method on a scene, where others have more.
+    pub(super) fn fewer_runs(&self) -> Vec<String> {
+        let mut methods: Vec<&str> = self.evaluations.iter().map(|e| e.method.as_str()).collect();
+        methods.sort_unstable();
+        methods.dedup();
+        let count = |method: &str, scene: &str| {
+            self.evaluations.iter().filter(|e| e.method == method && e.scene == scene).count()
+        };
+        let scenes = self.scenes();
+        let pairs: Vec<(&str, &str, usize)> =
+            methods.iter().flat_map(|m| scenes.iter().map(|s| (*m, s.as_str(), count(m, s)))).collect();
+        let most = pairs.iter().map(|p| p.2).max().unwrap_or(0);
+        let few = pairs.into_iter().filter(|p| p.2 < most);
+        few.map(|(method, scene, n)| format!("{method} on {scene}: {n} of {most} runs")).collect()
     }
 }
 
@@ -130,10 +151,14 @@ fn published_rows(table: &PublishedTable, metric: Metric, stage: Option<Stage>, 
         let values: Vec<Option<Cell>> = scenes.iter().map(|s| value(s).map(|v| cell(*v))).collect();
         let all = values.iter().flatten().count() == table.scenes.len();
         // A mean over other scenes than those shown would not compare with ours.
-        let mean = if all { Some(cell(r.mean)) } else { mean(&values) };
+        let mean = if all && (values.len() == table.scenes.len() || table.scenes.is_empty()) {
+            Some(cell(r.mean))
+        } else {
+            mean(&values)
+        };
         let whole = if table.scenes.is_empty() { ", all scenes" } else { "" };
         let source = Some(format!("{}, {}{whole}", table.paper, table.table));
-        mean.is_some().then(|| Row {
+        (mean.is_some() || values.iter().any(Option::is_some)).then(|| Row {
             metric,
             stage,
             method: r.method.clone(),
@@ -146,9 +171,9 @@ fn published_rows(table: &PublishedTable, metric: Metric, stage: Option<Stage>, 
     shown.collect()
 }
 
-/// Over scenes. It has a spread over runs only where it is of one scene.
+/// Over scenes, if all have a value: others would not compare. It has a spread over runs only where it is of one scene.
 fn mean(values: &[Option<Cell>]) -> Option<Cell> {
-    let known: Vec<Cell> = values.iter().flatten().copied().collect();
+    let known: Vec<Cell> = values.iter().copied().collect::<Option<_>>()?;
     match known[..] {
         [] => None,
         [only] => Some(only),

@@ -37,6 +37,7 @@ impl Table {
             let new: Vec<String> = of_run.filter(|n| !notes.contains(n)).collect();
             notes.extend(new);
         }
+        notes.extend(self.fewer_runs());
         notes
     }
 
@@ -107,7 +108,10 @@ impl Table {
                 rows.iter().filter(|r| (r.metric, r.stage) == (row.metric, row.stage) && competes(r)).collect();
             let cells = row.cells().enumerate().map(|(i, v)| {
                 let text = number(row.metric, v).replace('±', "$\\pm$");
-                if competes(row) && is_best(row.metric, v, group.iter().map(|r| r.cells().nth(i).flatten())) {
+                // A mean over scenes competes with those over the same ones.
+                let comparable = |r: &Row| i < r.values.len() || r.values.iter().all(Option::is_some);
+                let group = group.iter().filter(|r| comparable(r)).map(|r| r.cells().nth(i).flatten());
+                if competes(row) && comparable(row) && is_best(row.metric, v, group) {
                     format!("\\textbf{{{text}}}")
                 } else {
                     text
@@ -239,7 +243,7 @@ mod tests {
         let expected = "two scenes\n\
                                          method         fern    a_b   mean\n\
                         rotation (deg)     l2g           0.250  0.750  0.500\n\
-                                           barf [P, T] * 0.125      -  0.125\n";
+                                           barf [P, T] * 0.125      -      -\n";
         let squeeze =
             |s: &str| s.lines().map(|l| l.split_whitespace().collect::<Vec<_>>().join(" ")).collect::<Vec<_>>();
         let text = table().to_text();
@@ -254,7 +258,7 @@ mod tests {
     fn csv_quotes_and_latex_escapes() {
         let csv = table().to_csv();
         assert!(csv.starts_with("metric,stage,method,source,verified,fern,a_b,mean\n"), "{csv}");
-        assert!(csv.contains("rotation_error_deg,,barf,\"P, T\",false,0.125,,0.125\n"), "{csv}");
+        assert!(csv.contains("rotation_error_deg,,barf,\"P, T\",false,0.125,,\n"), "{csv}");
         let views = table().views_csv();
         assert!(views.contains("fern,l2g,cameras,\"cam, 1\",0.25,,,,,,,,,,,,,\n"), "{views}");
         assert!(views.contains("fern,l2g,before,mean,,,21,,,,,,,,,,,\n"), "{views}");
@@ -273,6 +277,33 @@ mod tests {
             assert!(told.len() == 1 && told[0].starts_with("l2g on fern: "), "{text}");
         }
         assert_eq!(serde_json::from_str::<Table>(&table.to_json()).unwrap(), table);
+    }
+
+    /// A method that lacks a scene or a run does not win by that.
+    #[test]
+    fn means_over_other_scenes_do_not_compete() {
+        let runs = [("fern", "l2g", 0.25), ("fern", "l2g", 0.35), ("a_b", "l2g", 0.75), ("fern", "inn", 0.5)];
+        let evaluations = runs.map(|(scene, method, degrees)| run(scene, method, degrees, [20.0; 2])).to_vec();
+        let table = Table { evaluations, ..table() };
+        let rows = table.rows();
+        let mean = |method: &str| rows.iter().find(|r| r.method == method).unwrap().mean.map(|c| c.mean);
+        assert_eq!((mean("l2g"), mean("inn"), mean("barf")), (Some(0.525), None, None));
+        let latex = table.to_latex();
+        assert!(!latex.contains("\\textbf{0.525}"), "nothing compares with it: {latex}");
+        for text in [table.to_text(), latex] {
+            for note in ["l2g on a_b: 1 of 2 runs", "inn on fern: 1 of 2 runs", "inn on a_b: 0 of 2 runs"] {
+                assert!(text.contains(note), "{text}");
+            }
+        }
+        assert_eq!(
+            super::super::Table { evaluations: table.evaluations[..2].to_vec(), ..table.clone() }.fewer_runs(),
+            [""; 0]
+        );
+        let mut planar = table.evaluations[..2].to_vec();
+        (planar[0].cameras.mean.success, planar[1].cameras.mean.success) = (Some(1.0), Some(0.0));
+        let rows = Table { evaluations: planar, ..table }.rows();
+        let success = rows.iter().find(|r| r.metric == Metric::Success).unwrap().values[0].unwrap();
+        assert_eq!((success.mean, success.spread), (0.5, None));
     }
 
     #[test]

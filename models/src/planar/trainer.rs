@@ -164,8 +164,8 @@ impl Training for Trainer {
         let found = self.evaluate()?;
         let warps = found.warps.iter().map(|w| std::array::from_fn(|i| w.0[(i / 3, i % 3)])).collect();
         metrics.last = Some(Final { entry: found.entry.clone(), seconds: seconds(), warps });
-        results::write_evaluation(folder, &self.settings, &self.data.grid, &found)?;
-        results::write_results(folder, layered, self, &found, metrics)
+        let measured = results::write_evaluation(folder, &self.settings, &self.data.grid, &found)?;
+        results::write_results(folder, layered, self, &found, &measured, metrics)
     }
     fn trial(&mut self) -> Result<Trial, Error> {
         let frame = timed(|| self.picture(false).map(drop))?;

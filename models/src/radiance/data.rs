@@ -306,13 +306,63 @@ mod tests {
         for (path, start) in [(&model, "colmap"), (&json, "file")] {
             layered.set(&format!("scene.poses={}", path.display())).unwrap();
             assert_eq!(layered.settings.start_name().as_deref(), Some(start));
-            let found = SpaceData::load(&layered, &|_, _| {}).unwrap().start.poses;
+            let data = SpaceData::load(&layered, &|_, _| {}).unwrap();
+            let note = format!("1 of 12 training views have no pose in {}", path.display());
+            assert!(data.scene.notes.iter().any(|n| n.starts_with(&note)), "{:?}", data.scene.notes);
+            let found = data.start.poses;
             for (i, (a, b)) in found.iter().zip(&truth).enumerate() {
                 let expected = if i == 4 { Pose::identity() } else { *b };
                 let apart = (a.rotation - expected.rotation).norm() + (a.translation - expected.translation).norm();
                 assert!(apart < 1e-6, "view {i} is off by {apart}");
             }
         }
+    }
+
+    /// Two cameras that another program lost do not turn the world of the others.
+    #[test]
+    fn outliers_among_poses_of_another_program() {
+        let (dir, mut layered) = made("barf-small", &[]);
+        let data = SpaceData::load(&layered, &|_, _| {}).unwrap();
+        let truth = data.truth.clone().unwrap();
+        let path = dir.path().join("poses.json");
+        let write = |poses: &[Pose]| {
+            let matrix = |p: &Pose| {
+                let flip = nalgebra::Matrix3::from_diagonal(&nalgebra::Vector3::new(1.0, -1.0, -1.0));
+                let (r, c) = ((flip * p.rotation).transpose(), p.center() * 0.5);
+                (0..3).map(|i| vec![r[(i, 0)], r[(i, 1)], r[(i, 2)], c[i]]).collect::<Vec<_>>()
+            };
+            let frame = |(view, pose): (&View, &Pose)| serde_json::json!({ "file_path": view.name, "transform_matrix": matrix(pose) });
+            let frames: Vec<_> = data.scene.train.iter().zip(poses).map(frame).collect();
+            std::fs::write(&path, serde_json::json!({ "frames": frames }).to_string()).unwrap();
+        };
+        let mut poses = truth.clone();
+        let lost = Pose::exp(&[0.5, 0.9, -0.4, 1.0, 2.0, -1.0]);
+        [10, 11].iter().for_each(|i| poses[*i] = lost.after(&poses[*i]));
+        write(&poses);
+        layered.set(&format!("scene.poses={}", path.display())).unwrap();
+        let found = SpaceData::load(&layered, &|_, _| {}).unwrap().start.poses;
+        for i in 0..10 {
+            let apart = (found[i].rotation - truth[i].rotation).norm() + (found[i].center() - truth[i].center()).norm();
+            assert!(apart < 1e-4, "view {i} is off by {apart}");
+        }
+        write(&poses[..1]);
+        let error = SpaceData::load(&layered, &|_, _| {}).map(|d| d.start).unwrap_err().to_string();
+        assert!(error.contains("poses.json") && error.contains("1 views") && error.contains("takes two"), "{error}");
+    }
+
+    #[test]
+    fn starts_of_another_scene_are_refused() {
+        let (dir, mut layered) = made("barf-small", &[]);
+        let data = SpaceData::load(&layered, &|_, _| {}).unwrap();
+        let start = dir.path().join("start.json");
+        std::fs::write(&start, data.start.to_json(None, data.scene.training_poses())).unwrap();
+        layered.set(&format!("scene.poses={}", start.display())).unwrap();
+        assert_eq!(SpaceData::load(&layered, &|_, _| {}).unwrap().start.poses, data.start.poses);
+        let other = tempfile::tempdir().unwrap();
+        make_scene(other.path(), &MakeOptions { views: 12, size: 8, seed: 1 }, &|_, _| {}).unwrap();
+        layered.set(&format!("scene.path={}", other.path().display())).unwrap();
+        let error = SpaceData::load(&layered, &|_, _| {}).map(|d| d.start).unwrap_err().to_string();
+        assert!(error.contains("start.json") && error.contains("another reference pose"), "{error}");
     }
 
     #[test]

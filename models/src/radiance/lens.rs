@@ -51,3 +51,48 @@ pub fn found(correction: &[f32]) -> FoundLens {
     let [a, b] = if correction.len() == 1 { [x(0); 2] } else { [x(0), x(1)] };
     FoundLens { focal_scale: [a.exp(), b.exp()], principal_shift: [x(2), x(3)] }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::experiment::Experiment;
+    use crate::radiance::model::INTRINSICS;
+    use crate::training::Training;
+
+    /// A field that was learned with the right lenses tells that they are wrong, and by how much.
+    #[test]
+    fn wrong_focal_lengths_are_found() {
+        let sets = [
+            "scene.image_size=[24,24]",
+            "scene.train_views=20",
+            "scene.poses=truth",
+            "train.rays=240",
+            "train.samples=24",
+            "train.refine_lens=focal",
+            "field.layers=[32,32]",
+            "field.bands=4",
+            "radiance.color_layers=[]",
+            "optim.lr=5e-3",
+            "optim.lr_end=5e-5",
+            "optim.lr_warp=5e-3",
+            "optim.lr_warp_end=5e-3",
+            "optim.warmup_pose=0",
+            "optim.steps=800",
+            "run.device=cpu",
+        ];
+        let preset = Experiment::preset("nerf-small").unwrap();
+        let mut explorer = sets.iter().fold(preset, |e, text| e.set(text).unwrap()).explorer().unwrap();
+        let right: Vec<f32> = explorer.learner_mut().session.get(INTRINSICS).unwrap();
+        for _ in 0..500 {
+            explorer.step().unwrap();
+            explorer.learner_mut().set(LENS, &[0.0]).unwrap();
+        }
+        let wrong: Vec<f32> = right.iter().enumerate().map(|(i, x)| if i % 4 < 2 { x / 1.1 } else { *x }).collect();
+        explorer.learner_mut().set(INTRINSICS, &wrong).unwrap();
+        for _ in 0..300 {
+            explorer.step().unwrap();
+        }
+        let [x, y] = explorer.found_lens().unwrap().unwrap().focal_scale;
+        assert!(x == y && (x - 1.1).abs() < 0.03, "{x}");
+    }
+}

@@ -122,7 +122,7 @@ pub fn write_report(
     let device = explorer.learner().device_name();
     let caption = "Cameras before and after: where they are taken to be (teal), where they are (purple), and the way between (red).";
     let drawings = vec![(caption, written.cameras.as_str())];
-    let (title, device, notes) = (layered.name.as_str(), device.as_str(), written.evaluation.notes());
-    let report = Report { title, device, metrics, notes, pictures, drawings, config: &config };
+    let (title, device, evaluation) = (layered.name.as_str(), device.as_str(), &written.evaluation);
+    let report = Report { title, device, metrics, evaluation, pictures, drawings, config: &config };
     Ok(folder.write("report.html", report.to_html()?.as_bytes())?)
 }

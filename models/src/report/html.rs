@@ -1,6 +1,7 @@
 //! The page: headline numbers, pictures, plots, numbers per patch, settings.
 
 use super::plots::{Curve, PlotError, plot};
+use crate::evaluation::{Evaluation, Metric, Stage};
 use crate::pictures::patch_color;
 use crate::run::metrics::{Entry, Measured, Metrics};
 use base64::{Engine, prelude::BASE64_STANDARD};
@@ -20,8 +21,7 @@ pub struct Report<'a> {
     pub title: &'a str,
     pub device: &'a str,
     pub metrics: &'a Metrics,
-    /// What is to be said of the numbers.
-    pub notes: Vec<String>,
+    pub evaluation: &'a Evaluation,
     pub pictures: Vec<Picture<'a>>,
     /// Drawings (SVG), after their captions.
     pub drawings: Vec<(&'a str, &'a str)>,
@@ -95,25 +95,25 @@ impl Report<'_> {
 
     fn headline(&self) -> String {
         let Some(last) = &self.metrics.last else { return String::new() };
-        let mut cards = match &last.entry.measured {
-            Measured::Planar { corner_error_px, .. } => {
-                vec![(format!("{:.2} px", corner_error_px.mean), "mean corner error")]
+        let mut cards: Vec<(String, String)> = vec![];
+        for metric in Metric::ALL {
+            let shown = |value: f64| format!("{value:.*}", metric.decimals());
+            let of_cameras = self.evaluation.cameras.mean.get(metric);
+            cards.extend(of_cameras.map(|v| (shown(v), metric.heading().to_string())));
+            for (stage, when) in [(Stage::Before, "test views"), (Stage::After, "test views, refined")] {
+                let of_views = self.evaluation.stage(stage).and_then(|m| m.mean.get(metric));
+                cards.extend(of_views.map(|v| (shown(v), format!("{}, {when}", metric.heading()))));
             }
-            Measured::Space { rotation_error_deg, translation_error_x100, .. } => {
-                let rotation = rotation_error_deg.map(|r| (format!("{r:.2}°"), "rotation error"));
-                let translation = translation_error_x100.map(|t| (format!("{t:.2}"), "translation error x 100"));
-                rotation.into_iter().chain(translation).collect()
-            }
-        };
-        cards.extend([
-            (format!("{:.1} dB", last.entry.psnr_db()), "PSNR of the last pixels"),
-            (duration(last.seconds), "time"),
-            (last.entry.step.to_string(), "steps"),
-        ]);
+        }
+        if matches!(last.entry.measured, Measured::Space { .. }) {
+            cards.push((format!("{:.2}", last.entry.psnr_db()), "PSNR (dB), last training pixels".into()));
+        }
+        cards.extend([(duration(last.seconds), "time".into()), (last.entry.step.to_string(), "steps".into())]);
         let cards =
             cards.iter().map(|(value, what)| format!("<div class=card><b>{value}</b><span>{what}</span></div>"));
-        let note: String = self.notes.iter().map(|note| format!("<p class=note>Note: {}.</p>", escape(note))).collect();
-        format!("<div class=cards>{}</div>{note}", cards.collect::<String>())
+        let notes = self.evaluation.notes();
+        let notes = notes.iter().map(|note| format!("<p class=note>Note: {}.</p>", escape(note)));
+        format!("<div class=cards>{}</div>{}", cards.collect::<String>(), notes.collect::<String>())
     }
 
     fn plots(&self) -> Result<Vec<(&'static str, String)>, PlotError> {

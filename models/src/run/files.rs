@@ -12,15 +12,46 @@ pub struct WriteError {
     pub source: std::io::Error,
 }
 
-/// Writes to a temporary file beside `path`, waits until it is on the disk, and puts it in place.
+/// Writes to a temporary file beside `path`, waits until it is on the disk, and puts it in place. What a link points to is
+/// replaced, not the link; what is no file, as a terminal or `/dev/null`, is written to.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
+    let refuse = |source| WriteError { path: path.to_path_buf(), source };
+    if path.metadata().is_ok_and(|m| !m.is_file() && !m.is_dir()) {
+        return std::fs::OpenOptions::new().write(true).open(path).and_then(|mut f| f.write_all(bytes)).map_err(refuse);
+    }
+    let linked = if path.is_symlink() { path.canonicalize().ok() } else { None };
+    let path = linked.as_deref().unwrap_or(path);
+    place(path, bytes, |file| file.persist(path).map(drop))
+}
+
+/// Refuses a path that nothing can be written to, before there is anything to write: one in no folder, or a folder.
+pub fn can_be_written(path: &Path) -> Result<(), WriteError> {
+    let refuse = |kind: std::io::ErrorKind| Err(WriteError { path: path.to_path_buf(), source: kind.into() });
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    match path.is_dir() {
+        true => refuse(std::io::ErrorKind::IsADirectory),
+        false if !folder.is_dir() => refuse(std::io::ErrorKind::NotFound),
+        false => Ok(()),
+    }
+}
+
+/// The same for a file that must not be there yet: of two that write one at a time, one gets an error.
+pub fn write_new(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
+    place(path, bytes, |file| file.persist_noclobber(path).map(drop))
+}
+
+fn place(
+    path: &Path,
+    bytes: &[u8],
+    persist: impl FnOnce(NamedTempFile) -> Result<(), tempfile::PersistError>,
+) -> Result<(), WriteError> {
     let refuse = |source| WriteError { path: path.to_path_buf(), source };
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let file = NamedTempFile::with_prefix_in(".raygrad-", folder).map_err(refuse)?;
     let mut plain = file.as_file();
     plain.write_all(bytes).and_then(|()| plain.sync_all()).map_err(refuse)?;
     make_readable(file.as_file()).map_err(refuse)?;
-    file.persist(path).map_err(|e| refuse(e.error))?;
+    persist(file).map_err(|e| refuse(e.error))?;
     sync_folder(folder).map_err(refuse)
 }
 
@@ -56,7 +87,34 @@ mod tests {
         write_atomically(&path, b"one").unwrap();
         write_atomically(&path, b"two").unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), b"two");
+        assert!(write_new(&path, b"three").is_err());
+        write_new(&dir.path().join("b.txt"), b"three").unwrap();
+        std::fs::remove_file(dir.path().join("b.txt")).unwrap();
         assert!(write_atomically(&path.join("below"), b"x").unwrap_err().to_string().contains("a.txt"));
         assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn links_and_devices_stay_what_they_are() {
+        use std::os::unix::fs::{FileTypeExt, symlink};
+        let dir = tempfile::tempdir().unwrap();
+        let (path, link, device) = (dir.path().join("a"), dir.path().join("link"), dir.path().join("pipe"));
+        write_atomically(&path, b"one").unwrap();
+        symlink(&path, &link).unwrap();
+        write_atomically(&link, b"two").unwrap();
+        assert!(link.is_symlink() && std::fs::read(&path).unwrap() == b"two");
+        // Of the kinds of files that are none this one takes no rights to make.
+        let made = std::process::Command::new("mkfifo").arg(&device).status();
+        if !made.is_ok_and(|s| s.success()) {
+            return;
+        }
+        let reader = std::thread::spawn({
+            let device = device.clone();
+            move || std::fs::read(device).unwrap()
+        });
+        write_atomically(&device, b"three").unwrap();
+        assert_eq!(reader.join().unwrap(), b"three");
+        assert!(device.metadata().unwrap().file_type().is_fifo());
     }
 }

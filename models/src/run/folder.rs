@@ -1,7 +1,7 @@
 //! The run folder: which run it holds, and that nothing of another run is overwritten.
 
 use super::checkpoint::MANIFEST;
-use super::files::{WriteError, write_atomically};
+use super::files::{WriteError, write_atomically, write_new};
 use super::lock::{LOCK, RunLock};
 use crate::config::{ConfigError, Count, DeviceChoice, Layered, Networks, Settings};
 use std::path::{Path, PathBuf};
@@ -195,16 +195,15 @@ impl RunFolder {
         }
         // Of two runs that claimed the folder together, one after the other, the one that makes the file has it.
         let config = self.path.join(CONFIG);
-        std::fs::OpenOptions::new().write(true).create_new(true).open(&config).map_err(|source| {
-            match source.kind() == std::io::ErrorKind::AlreadyExists {
-                true => FolderError::Occupied { path: self.path.clone(), difference: None },
-                false => FolderError::Access { path: config, source },
-            }
-        })?;
         // A setting that later versions add is then what that preset says: as it was before.
         let base = if settings.scene.is_some() { "l2g-blender" } else { "planar-l2g" };
         let text = format!("base = \"{base}\"\n\n{}", toml::to_string(settings).unwrap_or_default());
-        Ok(self.write(CONFIG, text.as_bytes())?)
+        write_new(&config, text.as_bytes()).map_err(|error| match error.source.kind() {
+            std::io::ErrorKind::AlreadyExists => FolderError::Occupied { path: self.path.clone(), difference: None },
+            _ => FolderError::from(error),
+        })?;
+        self.written.get_mut().push(config);
+        Ok(())
     }
 
     /// From here on the folder stays, whatever happens.

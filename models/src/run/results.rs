@@ -63,6 +63,7 @@ pub fn write_results(
     layered: &Layered,
     trainer: &mut Trainer,
     found: &Evaluation,
+    measured: &evaluation::Evaluation,
     metrics: &Metrics,
 ) -> Result<(), Error> {
     let grid = trainer.data.grid;
@@ -110,7 +111,7 @@ pub fn write_results(
         metrics,
         pictures: shown,
         drawings: vec![],
-        notes: vec![],
+        evaluation: measured,
         config: &config,
     };
     let report = report.to_html()?;

@@ -136,6 +136,9 @@ mod tests {
         // The last part of two names says nothing.
         let found = of(&["left/a.png", "right/a.png", "b.v2.png"]).of_views(path, &["right/a.png", "a", "b.v2.jpg"]);
         assert_eq!(found.unwrap(), [Some(pose(1.0)), None, Some(pose(2.0))]);
+        // Neither do two folders.
+        let found = of(&["val/a.png", "b.png"]).of_views(path, &["./train/a.png", "./train/b.png", "far/val/a"]);
+        assert_eq!(found.unwrap(), [None, Some(pose(1.0)), Some(pose(0.0))]);
         let error = named.of_views(path, &["x.png"]).unwrap_err().to_string();
         assert!(error.contains("model") && error.contains("`x.png`") && error.contains("`images/b.png`"), "{error}");
     }

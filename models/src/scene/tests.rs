@@ -186,6 +186,9 @@ fn dtu_cameras_for_images_of_another_size() {
     let dir = dtu();
     dtu_cameras(dir.path(), [20.0, 7.9]);
     refused(dir.path(), &all(), &["cameras.npz", "world_mat_", "(7.9, 12.0)", "another size"]);
+    // Five eighths of 32 columns.
+    dtu_cameras(dir.path(), [20.0, 20.0]);
+    refused(dir.path(), &all(), &["world_mat_", "another size"]);
 }
 
 #[test]
@@ -221,6 +224,16 @@ fn llff(name: impl Fn(usize) -> String) -> TempDir {
 fn rows_of_llff_are_in_the_plain_order_of_names() {
     paired(&load(llff(|i| format!("{i}.png")).path(), &all(), &|_, _| ()).unwrap(), 12);
     paired(&load(llff(|i| format!("IMG_{i:03}.png")).path(), &all(), &|_, _| ()).unwrap(), 12);
+}
+
+#[test]
+fn cameras_for_images_of_another_shape() {
+    let dir = llff(|i| format!("{i}.png"));
+    (0..12).for_each(|i| save(&dir.path().join(format!("images/{i}.png")), i, [16, 12]));
+    refused(dir.path(), &all(), &["poses_bounds.npy", "row 0", "16 x 12", "12 x 16"]);
+    // Halves of sides that are no whole numbers.
+    (0..12).for_each(|i| save(&dir.path().join(format!("images/{i}.png")), i, [5, 7]));
+    assert_eq!(load(dir.path(), &all(), &|_, _| ()).unwrap().train.len(), 11);
 }
 
 #[test]
@@ -304,6 +317,53 @@ fn intrinsics_of_blender_scenes_count() {
     let c = scene.train[0].intrinsics;
     assert_eq!((scene.layout, [c.fx, c.fy, c.cx, c.cy]), (Layout::Blender, [20.0, 20.0, 7.0, 6.0]));
     assert_eq!(scene.train[0].removed_distortion, Some([0.01, 0.0, 0.0, 0.0]));
+}
+
+#[test]
+fn angles_of_either_axis() {
+    let of = |change: fn(&mut Value)| {
+        let dir = transforms(change);
+        let camera = load(dir.path(), &all(), &|_, _| ()).unwrap().train[0].intrinsics;
+        [camera.fx, camera.fy]
+    };
+    let wide = |j: &mut Value| {
+        j.as_object_mut().unwrap().remove("fl_x");
+        (j["camera_angle_x"], j["camera_angle_y"]) = (json!(0.7), json!(1.2));
+    };
+    let [fx, fy] = of(wide);
+    assert!((fx - 8.0 / 0.35f64.tan()).abs() < 1e-9 && (fy - 6.0 / 0.6f64.tan()).abs() < 1e-9, "{fx} {fy}");
+    assert_eq!(of(|j| j["camera_angle_y"] = json!(1.2)), [20.0, 20.0], "focal lengths in pixels win");
+    refused(
+        transforms(|j| j["camera_angle_y"] = json!(-1.0)).path(),
+        &all(),
+        &["`camera_angle_y`", "between 0 and pi"],
+    );
+}
+
+#[test]
+fn names_of_images() {
+    // Endings in capitals, names with dots and no ending, and what macOS leaves beside files.
+    let dir = transforms(|j| {
+        j["frames"][2]["file_path"] = json!("images/02.PNG");
+        j["frames"][3]["file_path"] = json!("images/03.left");
+    });
+    let image = |name: &str| dir.path().join("images").join(name);
+    fs::rename(image("02.png"), image("02.PNG")).unwrap();
+    fs::rename(image("03.png"), image("03.left.png")).unwrap();
+    fs::write(image("._04.png"), "no image").unwrap();
+    assert_eq!(load(dir.path(), &all(), &|_, _| ()).unwrap().train.len(), 10);
+    let text = fs::read_to_string(dir.path().join("transforms.json")).unwrap();
+    fs::write(dir.path().join("transforms.json"), format!("\u{feff}{text}")).unwrap();
+    assert_eq!(load(dir.path(), &all(), &|_, _| ()).unwrap().train.len(), 10);
+    let folder = LoadOptions { layout: Some(Layout::Folder), ..all() };
+    let photos = load(&dir.path().join("images"), &folder, &|_, _| ()).unwrap();
+    assert_eq!(photos.train.len() + photos.test.len(), 12);
+}
+
+#[test]
+fn the_same_image_twice() {
+    let dir = transforms(|j| j["frames"][5] = j["frames"][6].clone());
+    refused(dir.path(), &all(), &["images/06.png", "twice"]);
 }
 
 #[test]

@@ -4,12 +4,11 @@ use crate::held::HeldRun;
 use crate::print;
 use crate::progress::bar;
 use crate::surface::{Surface, SurfaceArgs};
-use anyhow::bail;
 use clap::Args;
 use raygrad::Error;
 use raygrad::evaluation::{Evaluation, Measured, Metric, PublishedTable, Table, published_for};
 use raygrad::run::RunFolder;
-use raygrad::run::files::write_atomically;
+use raygrad::run::files::{can_be_written, write_atomically};
 use raygrad::scene::Layout;
 use raygrad::training::{Training, Watch};
 use serde::Serialize;
@@ -56,11 +55,8 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         experiment = experiment.lpips(weights)?;
     }
     let checked = args.surface.checked()?;
-    for path in [&args.csv, &args.latex].into_iter().flatten() {
-        let parent = path.parent().filter(|p| !p.as_os_str().is_empty());
-        if let Some(parent) = parent.filter(|p| !p.is_dir()) {
-            bail!("cannot write {}: there is no folder {}", path.display(), parent.display());
-        }
+    for path in [&args.csv, &args.latex, args.surface.mesh_file()].into_iter().flatten() {
+        can_be_written(path).map_err(Error::from)?;
     }
     let folder = RunFolder::open(&args.held.run).map_err(Error::from)?;
     let settings = experiment.layered.settings.clone();
@@ -68,10 +64,17 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     let had = |metric: Metric| earlier.contains(&format!("\"{}\"", metric.key()));
     // Ctrl-C ends this command at once: what it writes is written as whole files.
     let never = AtomicBool::new(false);
+    // As the run was asked to start: the experiment takes the copy that it keeps. Nor is a scene that has moved called otherwise.
+    let own = RunFolder::settings_of_run(&args.held.run).map_err(Error::from)?.settings;
+    let named = |evaluation: Evaluation| -> Result<Evaluation, Error> {
+        let named = Evaluation { scene: own.scene_name(), ..evaluation };
+        folder.write("evaluation.json", named.to_json().as_bytes())?;
+        Ok(named)
+    };
     let (mut evaluation, step, surface, layout);
     if settings.scene.is_some() || args.surface.wanted() {
         let mut explorer = experiment.restored_explorer()?;
-        evaluation = measure(&mut explorer, &folder, &never)?;
+        evaluation = named(measure(&mut explorer, &folder, &never)?)?;
         layout = Some(explorer.data.scene.layout);
         step = explorer.steps_done();
         // Of what was measured something is told in any case.
@@ -82,12 +85,11 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         }
     } else {
         let mut trainer = experiment.restored()?;
-        evaluation = measure(&mut *trainer, &folder, &never)?;
+        evaluation = named(measure(&mut *trainer, &folder, &never)?)?;
         (step, surface, layout) = (trainer.steps_done(), Ok(None), None);
     }
     let dataset = layout.map_or("planar", Layout::name);
-    // As the run was asked to start: the experiment takes the copy that it keeps.
-    let start = RunFolder::settings_of_run(&args.held.run).map_err(Error::from)?.settings.start_name();
+    let start = own.start_name();
     let scene = evaluation.scene.as_str();
     let published = published_for(dataset, start.as_deref(), &[scene], &[settings.method_name()]);
     let title = format!("{}, step {step} of {}", args.held.run.display(), settings.optim.taken());

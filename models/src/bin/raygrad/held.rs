@@ -11,6 +11,9 @@ pub struct HeldRun {
     /// Folder of its scene, where that has moved.
     #[arg(long, value_name = "DIR")]
     data: Option<String>,
+    /// Its photo, where that has moved.
+    #[arg(long, value_name = "FILE")]
+    image: Option<String>,
     /// Where to compute: `auto`, `cpu`, `wgpu` or `vulkan`, the latter two with `:N` for the Nth adapter.
     #[arg(long, value_name = "DEVICE")]
     device: Option<String>,
@@ -26,8 +29,23 @@ impl HeldRun {
     /// The experiment, from the settings in the folder.
     pub fn experiment(&self) -> Result<Experiment, Error> {
         let mut experiment = Experiment::of_run(&self.run)?;
+        let in_space = experiment.layered.settings.scene.is_some();
+        let misplaced = [
+            ("--data", &self.data, !in_space),
+            ("--fit-grid", &self.fit_grid, !in_space),
+            ("--image", &self.image, in_space),
+        ];
+        if let Some((option, ..)) = misplaced.iter().find(|(_, value, wrong)| *wrong && value.is_some()) {
+            let text = if in_space {
+                "the run is in space; `--data` names its scene"
+            } else {
+                "the run is in the plane; `--image` names its photo"
+            };
+            return Err(experiment.layered.refuse(option, text).into());
+        }
         let options = [
             ("--data", "scene.path", &self.data),
+            ("--image", "data.image", &self.image),
             ("--device", "run.device", &self.device),
             ("--threads", "run.threads", &self.threads),
             ("--fit-grid", "train.fit_grid", &self.fit_grid),

@@ -72,6 +72,11 @@ fn points(mesh: &Mesh, seed: u32) -> Result<Vec<[f64; 3]>, Error> {
 }
 
 impl SurfaceArgs {
+    /// The file that the mesh is to be written to.
+    pub fn mesh_file(&self) -> &Option<PathBuf> {
+        &self.mesh
+    }
+
     pub fn wanted(&self) -> bool {
         self.mesh.is_some() || self.cloud.is_some()
     }

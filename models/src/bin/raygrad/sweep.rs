@@ -85,7 +85,13 @@ fn train(
         Progress::Done(evaluation) => {
             let lacks = evaluation.before.as_ref().is_some_and(|b| b.mean.lpips.is_none());
             return match lpips.filter(|_| lacks) {
-                Some(weights) => measured_again(&cell.folder(folder), weights, stop).map(Some),
+                Some(weights) => match measured_again(&cell.folder(folder), weights, stop) {
+                    Err(error) if !matches!(error, Error::Stopped) => {
+                        eprintln!("{} stays without LPIPS: {error}", cell.name);
+                        Ok(Some(*evaluation))
+                    }
+                    other => other.map(Some),
+                },
                 None => Ok(Some(*evaluation)),
             };
         }
