@@ -109,6 +109,12 @@ impl SpaceData {
             ("noisy", NoiseKind::L2g) => {
                 InitialPoses::L2g { rotation: noise.rotation, translation: noise.translation }.draw(names(), seed)?
             }
+            (file, _) if !Path::new(file).exists() => {
+                let text = format!(
+                    "expected \"truth\", \"identity\", \"noisy\", \"auto\", or a file or folder of poses; there is no {file}"
+                );
+                return Err(layered.refuse("scene.poses", text).into());
+            }
             (file, _) => match NamedPoses::load(Path::new(file)).map_err(NoiseError::from)? {
                 Some(named) => {
                     let (start, lacking) = started_from(&named, Path::new(file), &scene)?;

@@ -172,6 +172,13 @@ fn cameras_for_other_programs_are_those_found() {
     let bytes = std::fs::read(w.path("out/cameras/poses_bounds.npy")).unwrap();
     assert_eq!(npyz::NpyFile::new(&bytes[..]).unwrap().shape(), [5, 17]);
     w.succeed(&["export", "run", "--out", "one", "--format", "colmap"]);
+    // Squeezed for training, they are for the files all the same.
+    w.succeed(&["train", "space.toml", "--out", "flat", "--steps", "1", "--set", "scene.image_size=[8,12]"]);
+    w.succeed(&["export", "flat", "--out", "out/flat"]);
+    let flat = w.json("out/flat/transforms.json");
+    let lens = |json: &Value| ["w", "h", "fl_x", "fl_y"].map(|key| json[key].as_f64().unwrap());
+    assert!(lens(&flat).iter().zip(lens(&transforms)).all(|(a, b)| (a - b).abs() < 1e-9), "{flat}");
+    std::fs::remove_dir_all(w.path("flat")).unwrap();
     assert_eq!(names(&w.path("one")), ["colmap"]);
 }
 
@@ -218,10 +225,22 @@ fn runs_that_are_none() {
         mentions(&refuse("empty"), &["no run in empty", "config.toml"]);
         mentions(&refuse("tiny.toml"), &["tiny.toml is not a folder"]);
     }
+    // The same folder, seen from elsewhere.
+    let here = w.path("scene").display().to_string();
+    w.succeed(&["train", "space.toml", "--out", "run", "--steps", "1", "--resume", "--data", &here]);
     // A scene that has moved is found again by hand.
     std::fs::rename(w.path("scene"), w.path("moved")).unwrap();
-    mentions(&w.refuse(&["eval", "run"]), &["cannot read scene"]);
+    mentions(&w.refuse(&["eval", "run"]), &["there is no scene", "`--data`"]);
     w.succeed(&["eval", "run", "--data", "moved"]);
+    assert_eq!(w.json("run/evaluation.json")["scene"], "scene", "it is the same one");
+    mentions(&w.refuse(&["eval", "run", "--data", "moved", "--image", "x.png"]), &["in space", "`--data`"]);
+    for (option, file) in [("--csv", "none/x.csv"), ("--latex", "empty"), ("--mesh", "none/x.ply")] {
+        mentions(&w.refuse(&["eval", "run", "--data", "moved", option, file]), &["cannot write", file]);
+    }
+    mentions(
+        &w.refuse(&["train", "space.toml", "--out", "x", "--data", "moved", "--set", "scene.poses=thruth"]),
+        &["`scene.poses`", "\"truth\"", "thruth"],
+    );
     mentions(&w.refuse(&["eval", "run", "--data", "empty"]), &["empty is not a scene"]);
     mentions(&w.refuse(&["eval", "run", "--data", "moved", "--device", "gpu"]), &["`raygrad devices`"]);
     std::fs::remove_file(w.path("run/checkpoint.json")).unwrap();

@@ -2,7 +2,7 @@
 
 use clap::Args;
 use raygrad::{Error, Experiment};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 #[derive(Args)]
 pub struct HeldRun {
@@ -51,6 +51,15 @@ impl HeldRun {
             ("--fit-grid", "train.fit_grid", &self.fit_grid),
         ];
         crate::set_options(&mut experiment, &options)?;
+        let settings = &experiment.layered.settings;
+        let (key, path, option) = match &settings.scene {
+            Some(scene) => ("scene.path", &scene.path, "--data"),
+            None => ("data.image", &settings.data.image, "--image"),
+        };
+        if path != "builtin" && !Path::new(path).exists() {
+            let text = format!("there is no {path}; `{option}` says where it is now");
+            return Err(experiment.layered.refuse(key, text).into());
+        }
         Ok(experiment)
     }
 }
