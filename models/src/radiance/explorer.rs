@@ -10,7 +10,7 @@ use super::results;
 use crate::Error;
 use crate::config::{DepthSettings, Layered, Method, RefineLens, Settings};
 use crate::estimate::Trial;
-use crate::evaluation::{Evaluation, FoundLens, Lpips, Metric, Stage};
+use crate::evaluation::{Evaluation, FoundLens, Lpips};
 use crate::geometry::Pose;
 use crate::run::metrics::{Entry, Final, Measured, Metrics, Relocalised};
 use crate::run::{Checkpoint, RunFolder};
@@ -386,25 +386,6 @@ impl Training for Explorer {
         &self.data.scene.notes
     }
     fn summary(&self, last: &Final) -> String {
-        let (steps, time) = (last.entry.step, crate::report::duration(last.seconds));
-        let mut text = String::new();
-        if let Measured::Space { rotation_error_deg: Some(r), translation_error_x100: Some(t), .. } =
-            last.entry.measured
-        {
-            text +=
-                &format!("rotation error     {r:.3} deg (mean over {} training views)\n", self.data.start.poses.len());
-            text += &format!("translation error  {t:.3} x 0.01\n");
-        }
-        for metric in Metric::ALL.into_iter().filter(|m| m.is_of_views()) {
-            let of = |stage| self.evaluation.as_ref().and_then(|e| e.stage(stage)?.mean.get(metric));
-            let Some(before) = of(Stage::Before) else { continue };
-            let refined = of(Stage::After).map_or(String::new(), |v| format!(", refined {v:.0$}", metric.decimals()));
-            let name = format!("test {}", metric.heading());
-            text += &format!("{name:<18} {before:.0$}{refined}\n", metric.decimals());
-        }
-        for note in self.evaluation.iter().flat_map(Evaluation::notes) {
-            text += &format!("note: {note}\n");
-        }
-        text + &format!("training PSNR      {:.2} dB\nsteps              {steps} in {time}\n", last.entry.psnr_db())
+        results::summary(self.data.start.poses.len(), last, self.evaluation.as_ref())
     }
 }

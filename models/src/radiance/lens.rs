@@ -57,7 +57,32 @@ mod tests {
     use super::*;
     use crate::experiment::Experiment;
     use crate::radiance::model::INTRINSICS;
+    use crate::scene::Intrinsics;
     use crate::training::Training;
+    use raygrad_compiler::reference::{Array, Bindings, evaluate};
+
+    /// What is told of a lens is what the graph computes with.
+    #[test]
+    fn a_found_lens_is_the_graphs() {
+        let given = Intrinsics { fx: 40.0, fy: 44.0, cx: 15.0, cy: 12.0, height: 24, width: 32, distortion: None };
+        for (refined, values) in [(RefineLens::Focal, vec![0.1f32]), (RefineLens::All, vec![0.1, -0.2, 0.05, -0.03])] {
+            let lens = Lens::new(refined);
+            let tensor = Tensor::data("given", Shape::new(&[], 4));
+            let correction = lens.correction.clone().unwrap().tensor;
+            let array = |t: &Tensor, values: Vec<f64>| Array::floats(t.shape(), values);
+            let bound: Bindings = [
+                ("given".to_string(), array(&tensor, vec![given.fx, given.fy, given.cx, given.cy])),
+                (LENS.to_string(), array(&correction, values.iter().map(|x| f64::from(*x)).collect())),
+            ]
+            .into_iter()
+            .collect();
+            let graph = evaluate(&[lens.corrected(&tensor)], &bound).unwrap().remove(0);
+            let told = found(&values).of(&given);
+            for (a, b) in graph.f().iter().zip([told.fx, told.fy, told.cx, told.cy]) {
+                assert!((a - b).abs() < 1e-9, "{graph:?} {told:?}");
+            }
+        }
+    }
 
     /// A field that was learned with the right lenses tells that they are wrong, and by how much.
     #[test]

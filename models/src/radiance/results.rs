@@ -5,12 +5,12 @@ use super::evaluate::{Found, evaluate};
 use super::explorer::Explorer;
 use crate::Error;
 use crate::config::Layered;
-use crate::evaluation::{CameraLayout, CameraPanel, DepthStyle, Evaluation, camera_plot, inverse_depth};
+use crate::evaluation::{CameraLayout, CameraPanel, DepthStyle, Evaluation, Metric, Stage, camera_plot, inverse_depth};
 use crate::geometry::Pose;
 use crate::pictures::{self, Canvas};
 use crate::report::{Picture, Report};
 use crate::run::RunFolder;
-use crate::run::metrics::Metrics;
+use crate::run::metrics::{Final, Measured, Metrics};
 use crate::run::results::{FRAMES, animation};
 use crate::scene::{Layout, View, stand_around};
 use crate::training::{Training, Watch};
@@ -125,4 +125,25 @@ pub fn write_report(
     let (title, device, evaluation) = (layered.name.as_str(), device.as_str(), &written.evaluation);
     let report = Report { title, device, metrics, evaluation, pictures, drawings, config: &config };
     Ok(folder.write("report.html", report.to_html()?.as_bytes())?)
+}
+
+/// The headline numbers of a run with so many training views, as lines of text.
+pub fn summary(views: usize, last: &Final, evaluation: Option<&Evaluation>) -> String {
+    let (steps, time) = (last.entry.step, crate::report::duration(last.seconds));
+    let mut text = String::new();
+    if let Measured::Space { rotation_error_deg: Some(r), translation_error_x100: Some(t), .. } = last.entry.measured {
+        text += &format!("rotation error     {r:.3} deg (mean over {views} training views)\n");
+        text += &format!("translation error  {t:.3} x 0.01\n");
+    }
+    for metric in Metric::ALL.into_iter().filter(|m| m.is_of_views()) {
+        let of = |stage| evaluation.and_then(|e| e.stage(stage)?.mean.get(metric));
+        let Some(before) = of(Stage::Before) else { continue };
+        let refined = of(Stage::After).map_or(String::new(), |v| format!(", refined {v:.0$}", metric.decimals()));
+        let name = format!("test {}", metric.heading());
+        text += &format!("{name:<18} {before:.0$}{refined}\n", metric.decimals());
+    }
+    for note in evaluation.into_iter().flat_map(Evaluation::notes) {
+        text += &format!("note: {note}\n");
+    }
+    text + &format!("training PSNR      {:.2} dB\nsteps              {steps} in {time}\n", last.entry.psnr_db())
 }
