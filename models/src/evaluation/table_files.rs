@@ -288,6 +288,15 @@ mod tests {
         let rows = table.rows();
         let mean = |method: &str| rows.iter().find(|r| r.method == method).unwrap().mean.map(|c| c.mean);
         assert_eq!((mean("l2g"), mean("inn"), mean("barf")), (Some(0.525), None, None));
+        // A mean over all scenes of a paper is none over these.
+        let mut whole = table.published[0].clone();
+        whole.scenes.clear();
+        let row = |values: &[f64]| PublishedRow { values: values.to_vec(), mean: 0.01, ..whole.rows[0].clone() };
+        let rows = vec![row(&[])];
+        let mut both = Table { published: vec![PublishedTable { rows, ..whole.clone() }], ..table.clone() };
+        both.evaluations.extend(["fern", "a_b"].map(|scene| run(scene, "mlp", 0.9, [20.0; 2])));
+        let latex = both.to_latex();
+        assert!(latex.contains("\\textbf{0.525}") && latex.contains("& 0.010"), "{latex}");
         let latex = table.to_latex();
         assert!(!latex.contains("\\textbf{0.525}"), "nothing compares with it: {latex}");
         for text in [table.to_text(), latex] {
