@@ -44,8 +44,8 @@ impl Estimate {
         let one = seconds_per_step(trainer)?;
         let trial = trainer.trial()?;
         trainer.restore(&begun)?;
-        let times = |every: usize| if every == 0 { 0 } else { steps / every - step / every };
-        let recurring = trial.recurring.iter().map(|(every, once)| times(*every) as f64 * once);
+        let recurring = trial.recurring.iter().filter(|(every, _)| *every > 0);
+        let recurring = recurring.map(|(every, once)| (steps / every - step / every) as f64 * once);
         let training = one * left as f64 + recurring.sum::<f64>();
         Ok(Some(Estimate { training, evaluation: trial.evaluation }))
     }

@@ -103,7 +103,7 @@ fn refined_lenses_are_told_and_exported() {
         let run = dir.path().join(refined);
         let outcome = tiny(&[&format!("train.refine_lens={refined}"), "optim.warmup_pose=0"], &run).train().unwrap();
         let mut explorer = Experiment::of_run(&run).unwrap().restored_explorer().unwrap();
-        let (found, given) = (explorer.found_lens().unwrap(), explorer.data.scene.train[0].intrinsics.clone());
+        let (found, given) = (explorer.found_lens().unwrap(), explorer.data.scene.train[0].intrinsics);
         let evaluation: Value = serde_json::from_slice(&std::fs::read(run.join("evaluation.json")).unwrap()).unwrap();
         (found, given, explorer.cameras().unwrap().remove(0), evaluation["lens"].clone(), outcome.summary)
     };

@@ -278,7 +278,7 @@ impl FoundLens {
     pub fn of(&self, given: &Intrinsics) -> Intrinsics {
         let (scale, shift) = (self.focal_scale, self.principal_shift);
         let (cx, cy) = (given.cx + shift[0] * given.fx, given.cy + shift[1] * given.fy);
-        Intrinsics { fx: given.fx * scale[0], fy: given.fy * scale[1], cx, cy, ..given.clone() }
+        Intrinsics { fx: given.fx * scale[0], fy: given.fy * scale[1], cx, cy, ..*given }
     }
 }
 

@@ -24,7 +24,7 @@ impl Explorer {
             DepthRange::Inverse { near } => [near / NEAR_PART, FAR * near / NEAR_PART],
         };
         let camera = |(view, pose): (&crate::scene::View, _)| {
-            let lens = refined.map_or(view.intrinsics.clone(), |found| found.of(&view.intrinsics));
+            let lens = refined.map_or(view.intrinsics, |found| found.of(&view.intrinsics));
             let [height, width] = view.file_size;
             let lens = lens.resized(height, width);
             ExportCamera {
