@@ -11,6 +11,8 @@ const MAX_BANDS: usize = 20;
 const MAX_BLOCKS: usize = 64;
 const MAX_PATCHES: usize = 1000;
 const MAX_SIDE: usize = 16384;
+/// Most pixels along a side of a grid on which poses are fitted: all views' at once, in memory.
+const MOST_FITTED: usize = 128;
 /// Most cells along a side of a view's map of errors.
 const MOST_CELLS: usize = 1024;
 /// Most samples of a ray.
@@ -125,6 +127,10 @@ impl Layered {
         if train.error_map > MOST_CELLS {
             let text = format!("expected at most {MOST_CELLS} cells along a side, found {}", train.error_map);
             return Err(self.refuse("train.error_map", text));
+        }
+        if train.fit_grid > MOST_FITTED {
+            let text = format!("expected at most {MOST_FITTED} pixels along a side, found {}", train.fit_grid);
+            return Err(self.refuse("train.fit_grid", text));
         }
         if !train.validate_every.is_multiple_of(s.run.log_every.max(1)) {
             let (every, found) = (s.run.log_every, train.validate_every);

@@ -212,6 +212,9 @@ fn a_planar_run_is_measured_by_its_corners() {
     for command in [&["export", "run", "--out", "x"][..], &["video", "run"], &["eval", "run", "--mesh", "m.ply"]] {
         mentions(&w.refuse(command), &["not of a 3D experiment"]);
     }
+    mentions(&w.refuse(&["eval", "run", "--fit-grid", "3"]), &["in the plane"]);
+    mentions(&w.refuse(&["eval", "run", "--data", "x"]), &["in the plane", "`--image`"]);
+    mentions(&w.refuse(&["eval", "run", "--image", "x.png"]), &["there is no x.png", "`--image`"]);
 }
 
 #[test]
@@ -234,6 +237,8 @@ fn runs_that_are_none() {
     w.succeed(&["eval", "run", "--data", "moved"]);
     assert_eq!(w.json("run/evaluation.json")["scene"], "scene", "it is the same one");
     mentions(&w.refuse(&["eval", "run", "--data", "moved", "--image", "x.png"]), &["in space", "`--data`"]);
+    mentions(&w.refuse(&["eval", "run", "--data", "moved", "--fit-grid", "999"]), &["`train.fit_grid`", "at most 128"]);
+    w.succeed(&["eval", "run", "--data", "moved", "--fit-grid", "3"]);
     for (option, file) in [("--csv", "none/x.csv"), ("--latex", "empty"), ("--mesh", "none/x.ply")] {
         mentions(&w.refuse(&["eval", "run", "--data", "moved", option, file]), &["cannot write", file]);
     }

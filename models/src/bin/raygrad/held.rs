@@ -30,17 +30,13 @@ impl HeldRun {
     pub fn experiment(&self) -> Result<Experiment, Error> {
         let mut experiment = Experiment::of_run(&self.run)?;
         let in_space = experiment.layered.settings.scene.is_some();
+        let (plane, space) = ("the run is in the plane", "the run is in space");
         let misplaced = [
-            ("--data", &self.data, !in_space),
-            ("--fit-grid", &self.fit_grid, !in_space),
-            ("--image", &self.image, in_space),
+            ("--data", &self.data, !in_space, format!("{plane}; `--image` names its photo")),
+            ("--fit-grid", &self.fit_grid, !in_space, format!("{plane}, where fits are measured on all pixels")),
+            ("--image", &self.image, in_space, format!("{space}; `--data` names its scene")),
         ];
-        if let Some((option, ..)) = misplaced.iter().find(|(_, value, wrong)| *wrong && value.is_some()) {
-            let text = if in_space {
-                "the run is in space; `--data` names its scene"
-            } else {
-                "the run is in the plane; `--image` names its photo"
-            };
+        if let Some((option, .., text)) = misplaced.into_iter().find(|(_, value, wrong, _)| *wrong && value.is_some()) {
             return Err(experiment.layered.refuse(option, text).into());
         }
         let options = [
