@@ -248,13 +248,15 @@ fn is_empty(path: &Path) -> Result<bool, FolderError> {
 
 /// The first setting in which two runs differ. Where a run computes is not part of what it is.
 pub fn difference(held: &Settings, wanted: &Settings) -> Option<String> {
+    // The same scene may be seen from elsewhere, where its path leads nowhere: what lies in it is compared once it is loaded.
+    let place = |s: &Settings| std::fs::canonicalize(&s.scene.as_ref()?.path).ok();
+    let moved = place(held).zip(place(wanted)).is_some_and(|(a, b)| a != b);
     let flat = |s: &Settings| {
         let mut s = s.clone();
         (s.run.device, s.run.threads) = (DeviceChoice::Auto, Count::All);
         (s.run.autotune, s.run.networks) = (false, Networks::Auto);
-        // The same folder seen from elsewhere; what lies in it is compared once it is loaded.
         let name = s.scene_name();
-        if let Some(scene) = &mut s.scene {
+        if let Some(scene) = s.scene.as_mut().filter(|_| !moved) {
             scene.path = name;
         }
         let mut leaves = vec![];
@@ -278,6 +280,24 @@ pub fn difference(held: &Settings, wanted: &Settings) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn scenes_are_the_same_from_wherever_they_are_seen() {
+        let dir = tempfile::tempdir().unwrap();
+        let at = |path: &str| {
+            let mut layered = Layered::load("l2g-small").unwrap();
+            layered.set(&format!("scene.path={path}")).unwrap();
+            layered.settings
+        };
+        let [one, other] = ["one", "other"].map(|part| {
+            let folder = dir.path().join(part).join("lego");
+            std::fs::create_dir_all(&folder).unwrap();
+            folder.display().to_string()
+        });
+        let same = |a: &str, b: &str| difference(&at(a), &at(b)).is_none();
+        assert!(same(&one, &format!("{one}/../lego/")) && same("gone/lego", &one) && same(&one, "lego"));
+        assert!(!same(&one, &other) && !same(&one, "builtin") && !same("gone/lego", "gone/fern"));
+    }
 
     #[test]
     fn another_run_is_never_overwritten() {
