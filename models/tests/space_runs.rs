@@ -145,6 +145,12 @@ fn poses_are_fitted_on_a_grid() {
     };
     let (drawn, all, more) = (of("local", 0), of("local", 16), of("local", 99));
     assert!(apart(&drawn, &all) > 1e-6 && all == more, "{drawn:?} {all:?}");
+    // A run that is to be measured so ends with the poses that it is measured by again.
+    let run = dir.path().join("fitted");
+    tiny(&["warp.method=local", "train.relocalise_every=0", "train.fit_grid=16"], &run).train().unwrap();
+    let found: Value = serde_json::from_slice(&std::fs::read(run.join("poses.json")).unwrap()).unwrap();
+    let learned: Vec<[f64; 12]> = serde_json::from_value(found["learned"].clone()).unwrap();
+    assert_eq!(learned, all.iter().map(|p| p.to_rows()).collect::<Vec<_>>());
     // One motion a view is the same at all pixels; the last step's is of the step before its update.
     let (drawn, some, all) = (of("global", 0), of("global", 2), of("global", 16));
     assert!(some == all && apart(&drawn, &all) < 0.05);

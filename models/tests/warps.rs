@@ -4,8 +4,11 @@ use raygrad::Experiment;
 use raygrad::config::{Dof, Layered, WarpSettings};
 use raygrad::testing::{check_gradients, check_gradients_on, devices, kernels};
 use raygrad::training::Training;
-use raygrad::warps::{GlobalWarp, ImplicitMlpWarp, InvertibleWarp, LocalWarp, MlpWarp, Points, Se3Field, Warp};
+use raygrad::warps::{
+    GlobalWarp, ImplicitMlpWarp, InvertibleWarp, LocalWarp, MlpWarp, Points, Registration, Se3Field, Warp,
+};
 use raygrad_compiler::functions::mlp::{Init, Parameter};
+use raygrad_compiler::reference::{Array, Bindings, evaluate};
 use raygrad_compiler::{Axis, Shape, Tensor};
 use raygrad_runtime::Device;
 
@@ -145,5 +148,54 @@ fn maps_to_something_else_are_refused() {
         let experiment = Experiment::preset("planar-l2g-small").expect("is there").warp(Mistaken(map));
         let experiment = experiment.device(Device::cpu(Some(1)).expect("starts a thread"));
         line(experiment.training().err().expect("refused").to_string());
+    }
+}
+
+/// Leaves points where they are, and would have them at the origin.
+#[derive(Debug)]
+struct Drawn;
+
+impl Warp for Drawn {
+    fn map(&self, at: &Points, _: &Tensor) -> Tensor {
+        at.position.clone()
+    }
+    fn code_width(&self) -> usize {
+        0
+    }
+    fn parameters(&self) -> Vec<Parameter> {
+        vec![]
+    }
+    fn dof(&self) -> Dof {
+        Dof::Pose
+    }
+    fn penalty(&self, _: &Points, _: &Tensor, mapped: &Tensor) -> Option<(Tensor, f64)> {
+        Some((mapped * mapped, 1.0))
+    }
+}
+
+/// In space a warp's own term is the mean over pixels and centres: those of two cameras, three pixels each.
+#[test]
+fn penalties_are_of_pixels_and_centers() {
+    let (frame, point) = (Axis::new("frame", 2), Axis::new("point", 3));
+    let position = Tensor::data("pixels", Shape::new(&[&frame, &point], 3));
+    let center = Tensor::data("centers", Shape::new(&[&frame], 3));
+    let of = |position: &Tensor, first| {
+        let xy = Tensor::data("xy", Shape::new(&[&point], 2));
+        Points { frame: frame.clone(), point: point.clone(), xy, position: position.clone(), first }
+    };
+    let (pixels, centers) = (of(&position, 0), of(&center, 3));
+    let code = Tensor::scalar(0.0);
+    let (values, middles) = ((0..18).map(f64::from).collect::<Vec<_>>(), vec![1.0, 2.0, 3.0, -4.0, 5.0, 0.5]);
+    let bound: Bindings = [
+        ("pixels".to_string(), Array::floats(position.shape(), values.clone())),
+        ("centers".to_string(), Array::floats(center.shape(), middles.clone())),
+    ]
+    .into_iter()
+    .collect();
+    let mean = |x: &[f64]| x.iter().map(|x| x * x).sum::<f64>() / x.len() as f64;
+    for (centers, expected) in [(None, mean(&values)), (Some(&centers), (mean(&values) + mean(&middles)) / 2.0)] {
+        let (penalty, weight) = Registration::new(&Drawn, &pixels, centers, &code, false).penalty.unwrap();
+        let found = evaluate(&[penalty], &bound).unwrap()[0].f()[0];
+        assert!((found - expected).abs() < 1e-9 && weight == 1.0, "{found} instead of {expected}");
     }
 }

@@ -89,15 +89,20 @@ impl Table {
         scenes
     }
 
-    /// All lines, by metric, then stage, ours first.
-    pub fn rows(&self) -> Vec<Row> {
-        let scenes = self.scenes();
+    /// Methods of our runs, in their order.
+    fn methods(&self) -> Vec<&str> {
         let mut methods: Vec<&str> = vec![];
         for e in &self.evaluations {
             if !methods.contains(&e.method.as_str()) {
                 methods.push(&e.method);
             }
         }
+        methods
+    }
+
+    /// All lines, by metric, then stage, ours first.
+    pub fn rows(&self) -> Vec<Row> {
+        let (scenes, methods) = (self.scenes(), self.methods());
         let mut rows = vec![];
         for metric in Metric::ALL {
             let stages: &[Option<Stage>] =
@@ -128,13 +133,10 @@ impl Table {
 
     /// How many runs there are of a method on a scene, where others have more.
     pub(super) fn fewer_runs(&self) -> Vec<String> {
-        let mut methods: Vec<&str> = self.evaluations.iter().map(|e| e.method.as_str()).collect();
-        methods.sort_unstable();
-        methods.dedup();
         let count = |method: &str, scene: &str| {
             self.evaluations.iter().filter(|e| e.method == method && e.scene == scene).count()
         };
-        let scenes = self.scenes();
+        let (scenes, methods) = (self.scenes(), self.methods());
         let pairs: Vec<(&str, &str, usize)> =
             methods.iter().flat_map(|m| scenes.iter().map(|s| (*m, s.as_str(), count(m, s)))).collect();
         let most = pairs.iter().map(|p| p.2).max().unwrap_or(0);
@@ -149,13 +151,10 @@ fn published_rows(table: &PublishedTable, metric: Metric, stage: Option<Stage>, 
         let cell = |mean: f64| Cell { mean, spread: r.spread };
         let value = |scene: &String| table.scenes.iter().position(|s| s == scene).and_then(|i| r.values.get(i));
         let values: Vec<Option<Cell>> = scenes.iter().map(|s| value(s).map(|v| cell(*v))).collect();
-        let all = values.iter().flatten().count() == table.scenes.len();
+        let complete = values.iter().flatten().count() == table.scenes.len();
+        let same = table.scenes.is_empty() || table.scenes.len() == scenes.len();
         // A mean over other scenes than those shown would not compare with ours.
-        let mean = if all && (values.len() == table.scenes.len() || table.scenes.is_empty()) {
-            Some(cell(r.mean))
-        } else {
-            mean(&values)
-        };
+        let mean = if complete && same { Some(cell(r.mean)) } else { mean(&values) };
         let whole = if table.scenes.is_empty() { ", all scenes" } else { "" };
         let source = Some(format!("{}, {}{whole}", table.paper, table.table));
         (mean.is_some() || values.iter().any(Option::is_some)).then(|| Row {

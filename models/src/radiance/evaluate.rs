@@ -41,7 +41,6 @@ pub fn evaluate(
     mut show: impl FnMut(&Seen) -> Result<(), Error>,
 ) -> Result<Found, Error> {
     let (data, lpips) = (explorer.data.clone(), explorer.lpips.clone());
-    explorer.settle()?;
     let (poses, lens) = (explorer.poses()?, explorer.found_lens()?);
     let similarity = data.similarity(&poses).map_err(SpaceDataError::from)?;
     let cameras = data.pose_scores(&poses).map_err(SpaceDataError::from)?;

@@ -374,6 +374,7 @@ impl Training for Explorer {
         // Of a finished run that is resumed no step was taken that could be measured.
         let entry = metrics.steps.last().cloned().map_or_else(|| self.measure(), Ok)?;
         metrics.last = Some(Final { entry, seconds: seconds(), warps: vec![] });
+        self.settle()?;
         let written = results::write_evaluation(folder, self, watch)?;
         results::write_report(folder, layered, self, metrics, &written)?;
         self.evaluation = Some(written.evaluation);

@@ -67,7 +67,11 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     // As the run was asked to start: the experiment takes the copy that it keeps. Nor is a scene that has moved called otherwise.
     let own = RunFolder::settings_of_run(&args.held.run).map_err(Error::from)?.settings;
     let named = |evaluation: Evaluation| -> Result<Evaluation, Error> {
-        let named = Evaluation { scene: own.scene_name(), ..evaluation };
+        let scene = own.scene_name();
+        if evaluation.scene == scene {
+            return Ok(evaluation);
+        }
+        let named = Evaluation { scene, ..evaluation };
         folder.write("evaluation.json", named.to_json().as_bytes())?;
         Ok(named)
     };
