@@ -18,7 +18,7 @@ use raygrad_compiler::reference::{Array, Bindings, evaluate};
 use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Program, Step, Target, compile};
 use raygrad_runtime::{Device, Precision};
-use raygrad_tests::backend::{devices_for_large_programs, reference, round, run};
+use raygrad_tests::backend::{devices, devices_for_large_programs, reference, round, run};
 use raygrad_tests::check::check;
 use raygrad_tests::{Rng, seed, total};
 use std::collections::HashMap;
@@ -218,7 +218,7 @@ fn poses_fitted_once_more() {
         if let Some(pixels) = bound.get_mut(FIT_PIXELS) {
             *pixels = Array::integers(&pixels.shape, SIZE.grid(3));
         }
-        check(&devices_for_large_programs(), &step, &bound).unwrap_or_else(|e| panic!("{preset}: {e}"));
+        check(&devices(), &step, &bound).unwrap_or_else(|e| panic!("{preset}: {e}"));
     }
 }
 
