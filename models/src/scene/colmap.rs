@@ -120,6 +120,21 @@ fn nearest_depth(images: &[Image], points: &[Point]) -> Option<f64> {
 const MODELS: [(&str, usize); 5] =
     [("SIMPLE_PINHOLE", 3), ("PINHOLE", 4), ("SIMPLE_RADIAL", 4), ("RADIAL", 5), ("OPENCV", 8)];
 
+/// The models that are not read, in the order of COLMAP's numbers, which go on from [`MODELS`].
+const OTHER_MODELS: [&str; 7] = [
+    "OPENCV_FISHEYE",
+    "FULL_OPENCV",
+    "FOV",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+    "THIN_PRISM_FISHEYE",
+    "RAD_TAN_THIN_PRISM_FISHEYE",
+];
+
+fn other_model(number: usize) -> &'static str {
+    OTHER_MODELS.get(number - MODELS.len()).copied().unwrap_or("of an unknown number")
+}
+
 fn intrinsics(model: &str, [height, width]: [usize; 2], p: &[f64]) -> Option<Intrinsics> {
     let (fx, fy, cx, cy, distortion) = match (model, p) {
         ("SIMPLE_PINHOLE", &[f, cx, cy]) => (f, f, cx, cy, None),
@@ -210,7 +225,7 @@ fn binary_cameras(path: &Path) -> Result<BTreeMap<u32, Intrinsics>, SceneError> 
     for _ in 0..file.u64()? {
         let (id, model) = (file.u32()?, file.u32()? as usize);
         let (width, height) = (file.u64()? as usize, file.u64()? as usize);
-        let Some((name, count)) = MODELS.get(model) else { return Err(bad_camera(path, id, &model.to_string())) };
+        let Some((name, count)) = MODELS.get(model) else { return Err(bad_camera(path, id, other_model(model))) };
         let mut parameters = vec![];
         for _ in 0..*count {
             parameters.extend(file.floats::<1>()?);
@@ -340,4 +355,34 @@ fn text_points(path: &Path) -> Result<Vec<Point>, SceneError> {
         points.push(Point { at, seen_by });
     }
     Ok(points)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The file `cameras.bin` of one camera of this model, of 8 x 6 pixels.
+    fn camera(model: u32) -> Vec<u8> {
+        let numbers = [50.0_f64, 4.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0].map(f64::to_le_bytes).concat();
+        [&1_u64.to_le_bytes()[..], &7_u32.to_le_bytes(), &model.to_le_bytes(), &8_u64.to_le_bytes(), &6_u64.to_le_bytes()]
+            .concat()
+            .into_iter()
+            .chain(numbers)
+            .collect()
+    }
+
+    #[test]
+    fn models_of_binary_files() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("cameras.bin");
+        let read = |model| {
+            std::fs::write(&path, camera(model)).unwrap();
+            binary_cameras(&path).map(|all| all[&7].fx).map_err(|e| e.to_string())
+        };
+        assert_eq!(read(0), Ok(50.0));
+        let error = read(5).unwrap_err();
+        assert!(error.contains("cameras.bin") && error.contains("camera 7"), "{error}");
+        assert!(error.contains("model OPENCV_FISHEYE"), "{error}");
+        assert!(read(99).unwrap_err().contains("unknown number"));
+    }
 }

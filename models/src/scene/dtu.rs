@@ -2,7 +2,9 @@
 //! `rs_dtu_4/DTU/SCAN`, with depth maps and masks in folders beside it.
 //!
 //! `world_mat_i` projects the world to pixels, P = K [R | -R c]; `scale_mat_i` holds the scale s and the centre m of the
-//! object, and the loaded world is (x - m) / s. The published depths, 1.2 to 5.2 at s = 300 mm, are 360 to 1560 mm.
+//! object, and the loaded world is (x - m) / s. The published depths, 1.2 to 5.2 at s = 300 mm, are 360 to 1560 mm; captures in
+//! other units, whose cameras are not at such distances from m, are looked at from 1 before m to 1 behind it (s in the world
+//! of the files), as NeuS does.
 //! Images go with the matrices of their number. Every eighth is for testing, from number 0 on, or what [`DtuSplit`] says.
 
 use super::numpy::{self, NumpyArray};
@@ -16,6 +18,10 @@ use std::path::{Path, PathBuf};
 
 const FILES: [&str; 2] = ["cameras_sphere.npz", "cameras.npz"];
 const NEAR_FAR_MM: [f64; 2] = [360.0, 1560.0];
+/// Nearest plane of captures in other units, in radii of the object.
+const LEAST_NEAR: f64 = 0.1;
+/// Largest shift in pixels that the skew of a camera may cause at the edge of its image.
+const SKEW: f64 = 0.5;
 
 pub(super) fn lacks(root: &Path) -> Option<String> {
     if !FILES.iter().any(|f| root.join(f).is_file()) {
@@ -129,6 +135,15 @@ pub(super) fn list(root: &Path, options: &LoadOptions) -> Result<Listing, SceneE
                 found: format!("one at ({cx:.1}, {cy:.1}); the cameras seem to be for images of another size"),
             });
         }
+        let sheared = k[(0, 1)].abs() / k[(1, 1)] * height as f64 / 2.0;
+        if sheared > SKEW {
+            return Err(SceneError::Field {
+                path: path.clone(),
+                field,
+                expected: "a camera without skew, its axes at right angles".into(),
+                found: format!("a skew of {:.3}, which moves pixels by up to {sheared:.1}", k[(0, 1)]),
+            });
+        }
         let intrinsics = Intrinsics { fx: k[(0, 0)], fy: k[(1, 1)], cx, cy, height, width, distortion: None };
         let (mask, depth) = (around.mask(root, &image, i), around.depth(i));
         Ok(Entry {
@@ -152,9 +167,25 @@ pub(super) fn list(root: &Path, options: &LoadOptions) -> Result<Listing, SceneE
         };
         chosen.into_iter().map(one).collect::<Result<Vec<Entry>, SceneError>>()
     });
+    let (train, test) = (train?, test?);
+    let (depth, notes) = depths(&frame, train.iter().chain(&test));
+    Ok(Listing { train, val: None, test, depth, frame, notes })
+}
+
+/// The published depths, or for captures in other units those around the object, and a note on them.
+fn depths<'a>(frame: &WorldFrame, entries: impl Iterator<Item = &'a Entry>) -> (DepthRange, Vec<String>) {
+    let distances = entries.filter_map(|e| Some(frame.load(&e.pose?).center().norm()));
+    let (least, most) = distances.fold((f64::INFINITY, 0.0_f64), |(a, b), d| (a.min(d), b.max(d)));
     let [near, far] = NEAR_FAR_MM.map(|mm| mm * frame.scale);
-    let depth = DepthRange::Metric { near, far };
-    Ok(Listing { train: train?, val: None, test: test?, depth, frame, notes: vec![] })
+    if near <= least && most <= far {
+        return (DepthRange::Metric { near, far }, vec![]);
+    }
+    let (near, far) = ((least - 1.0).max(LEAST_NEAR), most + 1.0);
+    let note = format!(
+        "the cameras are {least:.3} to {most:.3} radii of the object from it, not 360 to 1560 mm as those of DTU; depths from \
+         {near:.3} to {far:.3} are a guess from that"
+    );
+    (DepthRange::Metric { near, far }, vec![note])
 }
 
 /// The world of the object's unit sphere.

@@ -61,20 +61,24 @@ fn npy(shape: &str, values: &[f64]) -> Vec<u8> {
 
 /// A DTU scan of 12 cameras, the x of whose centres in mm is their number, for images of 24 x 32.
 fn dtu_cameras(root: &Path, focal_x: [f64; 2]) {
+    dtu_cameras_in(root, focal_x, 0.0, [300.0, 0.0]);
+}
+
+/// The same with a skew, and the radius and depth of the object.
+fn dtu_cameras_in(root: &Path, focal_x: [f64; 2], skew: f64, [radius, away]: [f64; 2]) {
     let file = fs::File::create(root.join("cameras.npz")).unwrap();
     let mut archive = zip::ZipWriter::new(file);
     let stored = zip::write::SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored);
     let [f, cx] = focal_x;
     for i in 0..12 {
         let x = f64::from(i);
-        let world = [f, 0.0, cx, -f * x, 0.0, f, 12.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+        let world = [f, skew, cx, -f * x, 0.0, f, 12.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
         let scale: [f64; 16] = std::array::from_fn(|k| {
-            if k == 15 {
-                1.0
-            } else if k % 5 == 0 {
-                300.0
-            } else {
-                0.0
+            match k {
+                15 => 1.0,
+                11 => away,
+                _ if k % 5 == 0 => radius,
+                _ => 0.0,
             }
         });
         for (name, values) in [("world", world), ("scale", scale)] {
@@ -191,6 +195,38 @@ fn dtu_cameras_for_images_of_another_size() {
     // Five eighths of 32 columns.
     dtu_cameras(dir.path(), [20.0, 20.0]);
     refused(dir.path(), &all(), &["world_mat_", "another size"]);
+}
+
+#[test]
+fn skewed_dtu_cameras() {
+    let dir = dtu();
+    // The shift at the upper and lower edge, 12 rows from the middle.
+    dtu_cameras_in(dir.path(), [40.0, 16.0], 2.0, [300.0, 0.0]);
+    refused(dir.path(), &all(), &["cameras.npz", "world_mat_", "skew of 2.000", "up to 0.6"]);
+    dtu_cameras_in(dir.path(), [40.0, 16.0], -1.0, [300.0, 0.0]);
+    assert_eq!(load(dir.path(), &all(), &|_, _| ()).unwrap().train.len(), 10);
+}
+
+#[test]
+fn depths_of_dtu_and_of_captures_in_other_units() {
+    let dir = dtu();
+    let scene = |radius, away| {
+        dtu_cameras_in(dir.path(), [40.0, 16.0], 0.0, [radius, away]);
+        load(dir.path(), &all(), &|_, _| ()).unwrap()
+    };
+    let range = |scene: &Scene, expected: [f64; 2]| {
+        let DepthRange::Metric { near, far } = scene.depth else { panic!("{:?}", scene.depth) };
+        assert!((near - expected[0]).abs() < 1e-9 && (far - expected[1]).abs() < 1e-9, "{near} {far}");
+    };
+    let mm = scene(300.0, 700.0);
+    range(&mm, [1.2, 5.2]);
+    assert!(mm.notes.is_empty());
+    // Centres of x 0 to 11, an object of radius 2 at (0, 0, 60).
+    let other = scene(2.0, 60.0);
+    range(&other, [29.0, 1.0 + 60_f64.hypot(11.0) / 2.0]);
+    assert!(other.notes[0].contains("30.000 to 30.500 radii"), "{}", other.notes[0]);
+    // Cameras amid it.
+    range(&scene(2000.0, 0.0), [0.1, 1.0 + 11.0 / 2000.0]);
 }
 
 #[test]
