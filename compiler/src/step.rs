@@ -63,7 +63,10 @@ impl Step {
         for (input, at) in all.iter().filter_map(|t| Some((t.op_as::<Input>()?, t.source()))) {
             match names.get(&*input.name) {
                 Some((first, before)) if *first != input => {
-                    let [first, second] = [first, input].map(|i| format!("{:?} {}", i.role, i.shape));
+                    let [first, mut second] = [first, input].map(|i| format!("{:?} {}", i.role, i.shape));
+                    if first == second {
+                        second += ", along other axes of the same names";
+                    }
                     return Err(StepError::Conflict { name: input.name.clone(), first, second, at: [before, at] });
                 }
                 _ => names.insert(&input.name, (input, at)),

@@ -64,6 +64,11 @@ pub enum Error {
         "the model uses the parameter `{name}`, which `parameters()` of its warp or field does not list: it would stay 0"
     )]
     UnlistedParameter { name: String },
+    #[error(
+        "the training step reads the input `{name}`, which nothing sets: it would stay 0. A warp's own numbers are constants, or \
+         parameters that its `parameters()` lists; what changes in training are the inputs `progress` and `step`"
+    )]
+    UnsetInput { name: String },
     #[error("stopped before everything was measured")]
     Stopped,
     #[error("`{what}` is not finite after step {step}; the last checkpoint is unharmed")]

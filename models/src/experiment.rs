@@ -13,7 +13,7 @@ use crate::Error;
 use crate::config::{ConfigError, DeviceChoice, Layered, Origin, Precision};
 use crate::estimate::Estimate;
 use crate::evaluation::Lpips;
-use crate::planar::{PlanarData, Trainer};
+use crate::planar::{PERTURBATION, PlanarData, Trainer};
 use crate::radiance::data::START;
 use crate::radiance::{Explorer, SpaceData};
 use crate::run::checkpoint::Checkpoint;
@@ -94,7 +94,7 @@ impl Experiment {
         let perturbation = &layered.settings.data.perturbation;
         let copies = [
             ("scene.poses", START, !["truth", "identity", "noisy", "auto"].contains(&poses)),
-            ("data.perturbation", "perturbation.json", !["drawn", ""].contains(&perturbation.as_str())),
+            ("data.perturbation", PERTURBATION, !["drawn", ""].contains(&perturbation.as_str())),
         ];
         for (key, name, _) in copies.into_iter().filter(|(.., is_file)| *is_file) {
             layered.set_text(key, &folder.join(name).to_string_lossy(), Origin::Option(name.to_string()));
@@ -177,6 +177,9 @@ impl Experiment {
             return Err(self.layered.refuse("--lpips", text).into());
         }
         let data = PlanarData::load(&self.layered)?;
+        if self.resume {
+            data.check_run(&self.folder(), settings)?;
+        }
         let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings, settings.data.patches));
         Trainer::new(settings, data, warp, self.open(settings.run.precision)?)
     }
@@ -209,6 +212,7 @@ impl Experiment {
         }
         let mut trainer = self.trainer()?;
         self.restore(&mut trainer)?;
+        trainer.settle()?;
         Ok(Box::new(trainer))
     }
 

@@ -6,7 +6,7 @@
 
 use crate::config::Dof;
 use crate::data::Random;
-use crate::warps::{Points, Registration, Warp, codes};
+use crate::warps::{CODE, Points, Registration, Warp, code_tensor, codes, move_by};
 use raygrad_compiler::autodiff::{grad, zeros_like};
 use raygrad_compiler::functions::mlp::Init;
 use raygrad_compiler::graph::topological;
@@ -21,6 +21,11 @@ use raygrad_runtime::{Device, DeviceError, RunError, Session};
 pub enum TestError {
     #[error("{order} derivative by `{input}`: the graph gives {found}, central differences give {expected}")]
     Gradient { order: &'static str, input: String, found: f64, expected: f64 },
+    #[error(
+        "`{promise}` is not what `Warp::map` does: it puts a point at {expected:?}, the map at {found:?}. `Warp::global` gives the \
+         homography from sensor to field, in space the pose (3, 4) that takes field points back to `at.position`"
+    )]
+    Promise { promise: &'static str, found: Vec<f64>, expected: Vec<f64> },
     #[error("`{output}` on {device}: {found}, in the reference {expected}")]
     Device { device: String, output: String, found: f64, expected: f64 },
     #[error(transparent)]
@@ -50,6 +55,8 @@ const SINGLE: f64 = 2e-4;
 struct Bench {
     scalar: Tensor,
     local: Tensor,
+    /// What the map is to be the same as, by the name of what says so, with a code of zeros or as it is.
+    promises: Vec<(&'static str, Tensor, bool)>,
     /// Points, code and parameters.
     inputs: Vec<Tensor>,
     bindings: Bindings,
@@ -72,8 +79,14 @@ impl Bench {
         let position = Tensor::parameter("centers", Shape::new(&[&frame], 3));
         let centers = (warp.dof() == Dof::Pose).then(|| Points { position, first: POINTS, ..at.clone() });
         let code = codes(warp, &frame);
-        let none = Tensor::scalar(0.0);
-        let found = Registration::new(warp, &at, centers.as_ref(), code.as_ref().map_or(&none, |c| &c.tensor), false);
+        let found = Registration::new(warp, &at, centers.as_ref(), &code_tensor(code.as_ref()), false);
+        let mut promises = vec![];
+        if found.residual.is_none() {
+            promises.push(("Warp::global", move_by(warp.dof(), &found.transform, &at.position), false));
+        }
+        if warp.zero_code_is_identity() {
+            promises.push(("Warp::zero_code_is_identity", at.position.clone(), true));
+        }
         let mut random = Random::new(0, "testing");
         let mut bindings = Bindings::new();
         let upstream = Tensor::data("upstream", expected);
@@ -87,7 +100,7 @@ impl Bench {
         if let Some((penalty, weight)) = &found.penalty {
             scalar = scalar + penalty * *weight;
         }
-        for t in topological([scalar.clone()]) {
+        for t in topological([scalar.clone()].into_iter().chain(promises.iter().map(|(_, t, _)| t.clone()))) {
             let Some(Input { name, shape, .. }) = t.op_as::<Input>() else { continue };
             let array = match shape.dtype {
                 DType::F32 => Array::floats(shape, (0..shape.lanes()).map(|_| 0.5 * random.normal()).collect()),
@@ -118,7 +131,29 @@ impl Bench {
             }
         });
         let inputs = inputs.into_iter().chain(parameters.into_iter().map(|p| p.tensor)).collect();
-        Ok(Bench { scalar, local: found.local, inputs, bindings })
+        Ok(Bench { scalar, local: found.local, promises, inputs, bindings })
+    }
+
+    /// Compares the map with what the warp says of it.
+    fn check_promises(&self) -> Result<(), TestError> {
+        for (promise, expected, without_code) in &self.promises {
+            let mut bindings = self.bindings.clone();
+            if let (true, Some(code)) = (without_code, bindings.get_mut(CODE)) {
+                code.f_mut().fill(0.0);
+            }
+            let axes = self.local.axes().union(expected.axes());
+            let both = [self.local.broadcast_to(&axes), expected.broadcast_to(&axes)];
+            let [found, expected] = [0, 1].map(|i| evaluate(&both[i..=i], &bindings));
+            let (found, expected, width) = (found?.remove(0), expected?.remove(0), self.local.width());
+            for (found, expected) in found.f().chunks(width).zip(expected.f().chunks(width)) {
+                let agree = |(a, b): (&f64, &f64)| (a - b).abs() <= TOLERANCE * (1.0 + b.abs());
+                if !found.iter().zip(expected).all(agree) {
+                    let (found, expected) = (found.to_vec(), expected.to_vec());
+                    return Err(TestError::Promise { promise, found, expected });
+                }
+            }
+        }
+        Ok(())
     }
 
     /// Compares the derivatives of `scalar` along a random direction of each input with central differences. The sum of
@@ -168,7 +203,7 @@ impl Bench {
     }
 }
 
-/// Checks the derivatives of a warp, first and second order, and its values and gradients on every device there is.
+/// Checks that a warp does what its `global` and `zero_code_is_identity` say, its derivatives, first and second order, and its values and gradients on every device there is.
 pub fn check_gradients(warp: &dyn Warp) -> Result<(), TestError> {
     check_gradients_on(warp, &devices()?)
 }
@@ -177,6 +212,7 @@ pub fn check_gradients(warp: &dyn Warp) -> Result<(), TestError> {
 /// on a software GPU.
 pub fn check_gradients_on(warp: &dyn Warp, devices: &[(String, Device)]) -> Result<(), TestError> {
     let bench = Bench::new(warp)?;
+    bench.check_promises()?;
     let (mut bindings, mut random) = (bench.bindings.clone(), Random::new(1, "testing"));
     let slope = bench.check("first", &bench.scalar, &mut bindings, &mut random)?;
     bench.check("second", &slope, &mut bindings, &mut random)?;

@@ -7,7 +7,10 @@ use raygrad::training::Training;
 use raygrad::warps::{
     GlobalWarp, ImplicitMlpWarp, InvertibleWarp, LocalWarp, MlpWarp, Points, Registration, Se3Field, Warp,
 };
+use raygrad_compiler::functions::lie::se3_exp;
+use raygrad_compiler::functions::matrix::{apply_affine, invert_pose};
 use raygrad_compiler::functions::mlp::{Init, Parameter};
+use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::reference::{Array, Bindings, evaluate};
 use raygrad_compiler::{Axis, Shape, Tensor};
 use raygrad_runtime::Device;
@@ -110,9 +113,7 @@ impl Warp for Shifted {
 fn forgotten_parameters_are_refused_and_penalties_are_means() {
     let trainer = |listed: bool| {
         let by = Parameter::new("shift", Shape::new(&[], 2), Init::Zero);
-        let sizes = ["data.image_size=[16,16]", "data.patch_crop=[8,8]", "data.points_per_patch=16", "run.device=cpu"];
-        let small = Experiment::preset("planar-l2g-small").and_then(|e| sizes.iter().try_fold(e, |e, s| e.set(s)));
-        small.and_then(|e| e.warp(Shifted { by, listed }).trainer())
+        tiny(Shifted { by, listed }).trainer()
     };
     let error = trainer(false).err().expect("refused").to_string();
     assert!(error.contains("the parameter `shift`") && error.contains("`parameters()`"), "{error}");
@@ -123,6 +124,97 @@ fn forgotten_parameters_are_refused_and_penalties_are_means() {
     assert!((loss["penalty"] - 0.3).abs() < 1e-3, "{loss:?}");
     let terms = loss["render"] + loss["penalty"] + loss.get("alignment").map_or(0.0, |a| 100.0 * a);
     assert!((loss["total"] - terms).abs() < 1e-4, "{loss:?}");
+}
+
+/// A warp that is not what it says.
+#[derive(Debug)]
+struct Promising {
+    map: fn(&Points, &Tensor) -> Tensor,
+    code: usize,
+    global: Option<fn(&Tensor) -> Tensor>,
+    dof: Dof,
+    identity: bool,
+}
+
+impl Warp for Promising {
+    fn map(&self, at: &Points, code: &Tensor) -> Tensor {
+        (self.map)(at, code)
+    }
+    fn code_width(&self) -> usize {
+        self.code
+    }
+    fn global(&self, _: &Axis, code: &Tensor) -> Option<Tensor> {
+        self.global.map(|global| global(code))
+    }
+    fn dof(&self) -> Dof {
+        self.dof
+    }
+    fn zero_code_is_identity(&self) -> bool {
+        self.identity
+    }
+}
+
+#[test]
+fn promises_of_warps_are_checked() {
+    let moved: fn(&Points, &Tensor) -> Tensor = |at, code| apply_affine(&se3_exp(code), &at.position);
+    let space = |global| Promising { map: moved, code: 6, global: Some(global), dof: Dof::Pose, identity: true };
+    let check = |warp: &Promising| check_gradients_on(warp, &[]);
+    check(&space(|code| invert_pose(&se3_exp(code)))).unwrap_or_else(|e| panic!("{e}"));
+    let text = check(&space(se3_exp)).expect_err("the wrong way round").to_string();
+    assert!(text.contains("`Warp::global` is not what `Warp::map` does") && text.contains("back"), "{text}");
+    let doubled = |at: &Points, code: &Tensor| &at.xy * 2.0 + code;
+    let plane = Promising { map: doubled, code: 2, global: None, dof: Dof::Homography, identity: true };
+    let text = check(&plane).expect_err("not the identity").to_string();
+    assert!(text.contains("`Warp::zero_code_is_identity` is not"), "{text}");
+    check(&Promising { identity: false, ..plane }).unwrap_or_else(|e| panic!("{e}"));
+}
+
+fn tiny(warp: impl Warp + 'static) -> Experiment {
+    let sizes = ["data.image_size=[16,16]", "data.patch_crop=[8,8]", "data.points_per_patch=16", "run.device=cpu"];
+    let small = Experiment::preset("planar-l2g-small").and_then(|e| sizes.iter().try_fold(e, |e, s| e.set(s)));
+    small.unwrap_or_else(|e| panic!("{e}")).warp(warp)
+}
+
+#[test]
+fn codes_and_inputs_that_nobody_gives_are_refused() {
+    let radial = |at: &Points, code: &Tensor| &at.xy * (1.0 + code.ch(0) * (at.x() * at.x() + at.y() * at.y()));
+    let warp = || Promising { map: radial, code: 0, global: None, dof: Dof::Homography, identity: false };
+    for text in [
+        check_gradients_on(&warp(), &[]).expect_err("refused").to_string(),
+        tiny(warp()).training().err().expect("refused").to_string(),
+    ] {
+        assert!(text.contains("its `code_width` is 0"), "{text}");
+    }
+    let heated = |at: &Points, code: &Tensor| {
+        &at.xy + code * Tensor::input("my.temperature", Role::PerStep, Shape::new(&[], 1))
+    };
+    let warp = Promising { map: heated, code: 2, global: None, dof: Dof::Homography, identity: false };
+    let mut training = tiny(warp).training().unwrap_or_else(|e| panic!("{e}"));
+    let text = training.step().expect_err("refused").to_string();
+    assert!(text.contains("`my.temperature`") && text.contains("nothing sets"), "{text}");
+}
+
+/// A term of negative weight is a reward, no mistake.
+#[test]
+fn penalties_may_be_rewards() {
+    #[derive(Debug)]
+    struct Rewarded;
+    impl Warp for Rewarded {
+        fn map(&self, at: &Points, code: &Tensor) -> Tensor {
+            &at.xy + code
+        }
+        fn code_width(&self) -> usize {
+            2
+        }
+        fn penalty(&self, _: &Points, _: &Tensor, mapped: &Tensor) -> Option<(Tensor, f64)> {
+            Some((mapped * mapped, -0.5))
+        }
+    }
+    let mut training = tiny(Rewarded).training().unwrap_or_else(|e| panic!("{e}"));
+    training.step().and_then(|()| training.wait()).unwrap_or_else(|e| panic!("{e}"));
+    let loss = training.measure().unwrap_or_else(|e| panic!("{e}")).loss;
+    let terms = loss["render"] - 0.5 * loss["penalty"] + loss.get("alignment").map_or(0.0, |a| 100.0 * a);
+    assert!((loss["total"] - terms).abs() < 1e-4 && loss["penalty"] > 0.0, "{loss:?}");
 }
 
 /// A warp that gives what its function makes of the points.

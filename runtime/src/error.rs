@@ -31,6 +31,8 @@ pub enum RunError {
     Length { name: String, shape: Shape, expected: usize, found: usize },
     #[error("input `{name}` is {shape}, the values given are {found}")]
     Type { name: String, shape: Shape, found: &'static str },
+    #[error("`{name}` is {shape}: read its lanes (`read_lanes`, `get_lanes`), not floats")]
+    Lanes { name: String, shape: Shape },
     #[error("input `{name}` is {first} in one program of the session and {second} in another")]
     Conflict { name: String, first: Shape, second: Shape },
     #[error(

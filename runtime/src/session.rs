@@ -135,6 +135,8 @@ impl Session {
 
     /// The current value of a float input, in host order; waits for the device.
     pub fn get(&mut self, name: &str) -> Result<Vec<f32>, RunError> {
+        let info = self.inputs.get(name).ok_or_else(|| RunError::UnknownInput(name.into()))?;
+        of_floats(name, &info.shape)?;
         Ok(bytemuck::allocation::cast_vec(self.get_lanes(name)?))
     }
 
@@ -160,18 +162,24 @@ impl Session {
 
     /// A float output of the program's last run, in host order; waits for the device.
     pub fn read(&mut self, program: ProgramId, output: &str) -> Result<Vec<f32>, RunError> {
+        let (_, _, shape) = self.output(program, output)?;
+        of_floats(output, &shape)?;
         Ok(bytemuck::allocation::cast_vec(self.read_lanes(program, output)?))
     }
 
     /// The lanes of any output, in host order; waits for the device.
     pub fn read_lanes(&mut self, program: ProgramId, output: &str) -> Result<Vec<u32>, RunError> {
+        let (number, buffer, shape) = self.output(program, output)?;
+        let lanes = self.executor.output(number, buffer)?;
+        Ok(to_host(lanes, &shape))
+    }
+
+    fn output(&self, program: ProgramId, output: &str) -> Result<(usize, BufferId, Shape), RunError> {
         let number = self.own(program)?;
         let plan = &self.programs[number];
         let found = plan.outputs.iter().find(|(name, _)| name == output);
         let (_, buffer) = found.ok_or_else(|| RunError::UnknownOutput(output.into()))?;
-        let shape = plan.buffer(*buffer).shape.clone();
-        let lanes = self.executor.output(number, *buffer)?;
-        Ok(to_host(lanes, &shape))
+        Ok((number, *buffer, plan.buffer(*buffer).shape.clone()))
     }
 
     /// A loaded program.
@@ -186,6 +194,11 @@ impl Session {
     fn own(&self, program: ProgramId) -> Result<usize, RunError> {
         if program.session == self.id { Ok(program.number) } else { Err(RunError::OtherSession) }
     }
+}
+
+/// Lanes of whole numbers are no floats.
+fn of_floats(name: &str, shape: &Shape) -> Result<(), RunError> {
+    if shape.dtype == DType::F32 { Ok(()) } else { Err(RunError::Lanes { name: name.into(), shape: shape.clone() }) }
 }
 
 /// Programs may be recorded with axes of their own: names and sizes must agree.

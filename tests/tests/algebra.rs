@@ -106,7 +106,7 @@ fn positions_of_extremes_are_the_first_of_equal_ones() {
     let (x, bindings) = bind("x", Shape::new(&[&row], 3), values);
     let (most, least) = (x.argmax_channels().to_f32(), x.argmin_channels().to_f32());
     let found = everywhere(&[most, least], &bindings, 0.0);
-    assert_eq!(found, [[1.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.0, 2.0]]);
+    assert_eq!(found, [[1.0, 2.0, 2.0, 0.0], [0.0, 0.0, 1.0, 2.0]]);
 }
 
 #[test]

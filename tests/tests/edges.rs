@@ -179,13 +179,17 @@ fn larger(a: f32, b: f32) -> f32 {
 #[test]
 fn maxima_and_minima_pass_nan_on() {
     type Case<'f> = (&'f str, &'f dyn Fn(&Tensor) -> Tensor, fn(f32, f32) -> f32);
-    let cases: [Case; 8] = [
+    let cases: [Case; 11] = [
         ("max", &|x| x.ch(0).max(&x.ch(1)), larger),
         ("min", &|x| x.ch(0).min(&x.ch(1)), |a, b| -larger(-a, -b)),
         ("max_channels", &|x| x.max_channels(), larger),
         ("relu", &|x| x.ch(0).relu(), |a, _| larger(a, 0.0)),
         ("clamp", &|x| x.ch(0).clamp(-1.0, 0.5), |a, _| a.clamp(-1.0, 0.5)),
         ("clamp from below", &|x| x.ch(0).clamp(-1.0, f64::INFINITY), |a, _| larger(a, -1.0)),
+        // No driver may make a product of it.
+        ("powf of 2", &|x| x.ch(0).powf(2.0), |a, _| if a < 0.0 { f32::NAN } else { a * a }),
+        ("powf of 1", &|x| x.ch(0).powf(1.0), |a, _| if a < 0.0 { f32::NAN } else { a }),
+        ("powf of 0", &|x| x.ch(0).powf(0.0), |_, _| 1.0),
         ("elu", &|x| Activation::Elu.apply(&x.ch(0)), |a, _| if a > 0.0 { a } else { a.exp_m1() }),
         ("softplus", &|x| x.ch(0).softplus(1.0), |a, _| if a > 20.0 { a } else { a.exp().ln_1p() }),
     ];

@@ -6,16 +6,16 @@ use raygrad_compiler::functions::inverse::{determinant, solve};
 use raygrad_compiler::functions::lie::{se3_exp, sl3_exp, so3_exp};
 use raygrad_compiler::functions::loss::charbonnier;
 use raygrad_compiler::functions::matrix::{apply_homography, matmul};
-use raygrad_compiler::functions::mlp::Activation;
+use raygrad_compiler::functions::mlp::{Activation, Mlp, MlpSpec};
 use raygrad_compiler::functions::posenc::positional_encoding;
 use raygrad_compiler::functions::vector::{norm, normalize};
 use raygrad_compiler::graph::{Axes, Axis, Shape, Tensor, topological};
 use raygrad_compiler::ops::custom::custom_adjoint;
 use raygrad_compiler::ops::map;
-use raygrad_compiler::reference::{Array, Bindings, EvalError, evaluate};
+use raygrad_compiler::reference::{Array, Bindings, Direction, EvalError, central_difference, evaluate};
 use raygrad_compiler::scalar::DType;
 use raygrad_compiler::{Step, Target, compile};
-use raygrad_tests::own_op;
+use raygrad_tests::{own_op, total};
 
 fn message(t: &Tensor) -> String {
     t.error().expect("does not fit").to_string()
@@ -91,7 +91,7 @@ fn axes_made_twice() {
     assert_eq!(
         message(&product),
         format!(
-            "mul: axis `frame` has size 5 in one operand and 6 in another at {here}\n  operand 1: [frame=5] x 1, from {from_a}\n  \
+            "mul: axis `frame` has size 5 in one place and 6 in another at {here}\n  operand 1: [frame=5] x 1, from {from_a}\n  \
              operand 2: [frame=6] x 1, from {from_b}\n  \
              hint: make the axis once with Axis::new and clone it, or give the second another name"
         )
@@ -172,6 +172,50 @@ fn other_arguments() {
     assert!(message(&x.channel_groups(vec![])).contains("no groups of channels"));
     assert!(message(&map(own_op::Neg, &[&x, &x])).contains("2 operands for an op of 1"));
     assert!(message(&jvp(&x.sin(), &[&x], &[])).contains("0 tangents for 1 inputs"));
+    let wider = Tensor::data("wider", Shape::new(&[&Axis::new("other", 3)], 4));
+    for tangent in [wider, Tensor::constant(&[1.0, 2.0])] {
+        let text = message(&jvp(&x.sin(), &[&x], &[&tangent]));
+        assert!(text.contains("a tangent (operand 2) does not fit its input") && text.contains("errors.rs"), "{text}");
+    }
+    let whole = x.to_u32();
+    for (loss, by) in [(&whole, &x), (&x, &whole)] {
+        let text = message(&grad(loss, &[by])[0]);
+        assert!(text.contains("whole numbers have no derivative") && text.contains("errors.rs"), "{text}");
+    }
+    let spec = MlpSpec::new("net", &[4, 8, 2]).skip(&[1, 7]);
+    assert!(message(&Mlp::new(spec).apply(&x)).contains("layer 7 sees the input again, but there are 2 layers"));
+}
+
+#[test]
+fn two_axes_of_one_name_in_one_shape() {
+    let (first, second) = (Axis::new("frame", 3), Axis::new("frame", 3));
+    let x = Tensor::data("x", Shape::new(&[&first], 1));
+    let wider = x.broadcast_to(&Axes::new([first.clone(), second.clone()]));
+    assert!(message(&wider).contains("two different axes are called `frame`"));
+    assert!(message(&Tensor::data("y", Shape::new(&[&first, &second], 1))).contains("two different axes"));
+    // Of one name, which is along two axes of one name.
+    let y = Tensor::data("x", Shape::new(&[&second], 1));
+    let outputs = vec![("x".to_string(), total(&x)), ("y".to_string(), total(&y))];
+    let text = Step { outputs, updates: vec![] }.check().expect_err("refused").to_string();
+    assert!(text.contains("along other axes of the same names"), "{text}");
+}
+
+#[test]
+fn central_differences_of_what_is_not_there() {
+    let row = Axis::new("row", 3);
+    let (x, n) = (Tensor::data("x", Shape::new(&[&row], 1)), Tensor::index(&row));
+    let mut bound = Bindings::from([("x".to_string(), Array::floats(x.shape(), vec![1.0, 2.0, 3.0]))]);
+    bound.insert("n".into(), Array::integers(n.shape(), vec![0, 1, 2]));
+    let refused = |output: &Tensor, name: &str, direction: &Direction, part: &str| {
+        let text = central_difference(output, &bound, name, direction, 1e-3).expect_err("refused").to_string();
+        assert!(text.contains(name) && text.contains(part), "{text}");
+    };
+    refused(&x, "y", &Direction::Lane(0), "no input of that name");
+    refused(&x, "x", &Direction::Lane(3), "no lane 3");
+    refused(&x, "x", &Direction::Along(&[1.0]), "the direction has 1 numbers");
+    refused(&x, "n", &Direction::Lane(0), "u32");
+    refused(&x.to_u32(), "x", &Direction::Lane(0), "whole numbers");
+    assert_eq!(central_difference(&(&x * 2.0), &bound, "x", &Direction::Lane(2), 0.5).ok(), Some(2.0));
 }
 
 #[test]

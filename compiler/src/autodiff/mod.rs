@@ -20,6 +20,10 @@ pub fn vjp(output: &Tensor, upstream: &Tensor, wanted: &[&Tensor]) -> Vec<Tensor
     if let Some(bad) = [output, upstream].into_iter().chain(wanted.iter().copied()).find(|t| t.error().is_some()) {
         return vec![bad.clone(); wanted.len()];
     }
+    if let Some(bad) = [output].into_iter().chain(wanted.iter().copied()).find(|t| t.dtype() == DType::U32) {
+        let problem = "whole numbers have no derivative";
+        return vec![Tensor::misfit("grad", &[bad], problem, "differentiate before rounding to u32, or by a float"); wanted.len()];
+    }
     let order = topological([output.clone()]);
     // Inputs of one name are one input, however often they were recorded.
     let (mut first, mut same) = (HashMap::new(), HashMap::new());
@@ -73,6 +77,13 @@ pub fn jvp(output: &Tensor, inputs: &[&Tensor], tangents: &[&Tensor]) -> Tensor 
     if inputs.len() != tangents.len() {
         let problem = format!("{} tangents for {} inputs", tangents.len(), inputs.len());
         return Tensor::misfit("jvp", &[output], problem, "give one tangent an input");
+    }
+    for (input, tangent) in inputs.iter().zip(tangents) {
+        let fits = tangent.axes().is_subset(input.axes()) && [1, input.width()].contains(&tangent.width());
+        if !fits && input.error().is_none() && tangent.error().is_none() {
+            let problem = "a tangent (operand 2) does not fit its input (operand 1)";
+            return Tensor::misfit("jvp", &[input, tangent], problem, "give one direction, of the input's axes and channels");
+        }
     }
     // It is linear in this one, which no program ever sees; derivatives of derivatives have one each.
     let name = format!("jvp.upstream {}", output.id());

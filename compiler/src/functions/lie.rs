@@ -39,7 +39,7 @@ pub fn cross(a: &Tensor, b: &Tensor) -> Tensor {
     a.pick(&[1, 2, 0]) * b.pick(&[2, 0, 1]) - a.pick(&[2, 0, 1]) * b.pick(&[1, 2, 0])
 }
 
-/// Rotation `(3, 3)` of a rotation vector.
+/// Rotation `(3, 3)` of a rotation vector, of at most 5 radians: of 12 what the series gives is no rotation.
 #[track_caller]
 pub fn so3_exp(w: &Tensor) -> Tensor {
     match expect_width("so3_exp", "rotation vectors", w, 3) {
@@ -61,7 +61,8 @@ fn rotation(w: &Tensor, coefficients: &Tensor) -> Tensor {
     turned.reshape((3, 3)) + identity(3)
 }
 
-/// Pose `[R | V u]`, `(3, 4)`, of a twist `(w, u)`: three rotation channels, then three of translation.
+/// Pose `[R | V u]`, `(3, 4)`, of a twist `(w, u)`: three rotation channels, of at most 5 radians
+/// ([`so3_exp`]), then three of translation.
 #[track_caller]
 pub fn se3_exp(twist: &Tensor) -> Tensor {
     if let Err(bad) = expect_width("se3_exp", "twists", twist, 6) {
@@ -91,7 +92,7 @@ fn turn(c: &Tensor, s: &Tensor) -> Tensor {
 }
 
 /// Rigid motion `[R | V u]`, `(2, 3)`, of `(u_x, u_y, theta)`, with `V = [[A, -B], [B, A]]`, `A = sin(theta) / theta`
-/// and `B = (1 - cos(theta)) / theta`.
+/// and `B = (1 - cos(theta)) / theta`, good for `|theta| < 5`.
 #[track_caller]
 pub fn se2_exp(motion: &Tensor) -> Tensor {
     if let Err(bad) = expect_width("se2_exp", "rigid motions", motion, 3) {

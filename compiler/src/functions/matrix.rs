@@ -139,27 +139,22 @@ pub fn apply_homography(h: &Tensor, x: &Tensor) -> Tensor {
 /// nothing of smaller ones, and dividing by what rounding left of them loses the digits of everything else.
 const SINGULAR: f64 = 1e-9;
 
-/// `G^-1 b` for a symmetric positive `G`, `(n, n)` with n <= 9, and n channels, by the eigen-decomposition of G.
+/// `G^-1 b` for a symmetric `G`, `(n, n)` with n <= 9, and n channels, by the eigen-decomposition of (the symmetric part of) G.
 ///
 /// The gradient is that of the solution itself, `dG = -(G^-1 g) h^T` symmetrised and `db = G^-1 g`, not the one composed
 /// from eigenvectors: that loses all digits where eigenvalues meet, while the solution does not notice.
 #[track_caller]
 pub fn solve_symmetric(g: &Tensor, b: &Tensor) -> Tensor {
-    let n = match g.channels() {
-        Channels::Matrix(r, c) if r == c && b.width() == r => r,
-        other => {
-            let problem = format!("channels {other} are no system for {} channels", b.channels());
-            return Tensor::misfit(
-                "solve_symmetric",
-                &[g, b],
-                problem,
-                "the matrix is (n, n), the right side has n channels",
-            );
-        }
-    };
+    if !matches!(g.channels(), Channels::Matrix(r, c) if r == c && b.width() == r) {
+        let problem = format!("channels {} are no system for {} channels", g.channels(), b.channels());
+        let hint = "the matrix is (n, n), the right side has n channels";
+        return Tensor::misfit("solve_symmetric", &[g, b], problem, hint);
+    }
     let (values, vectors) = g.stop_gradient().sym_eig();
-    let least = values.slice(n - 1..n).abs() * SINGULAR;
-    let along = apply(&vectors.transpose(), b) / values.max(&least);
+    let least = values.abs().max_channels() * SINGULAR;
+    // What rounding has made of a small positive one is no negative one.
+    let divisors = values.less_than(&-&least).select(&values, &values.max(&least));
+    let along = apply(&vectors.transpose(), b) / divisors;
     let solution = apply(&vectors, &along);
     custom_adjoint(&solution, &[g, b], |inputs, grad| {
         let (g, b) = (&inputs[0], &inputs[1]);

@@ -194,6 +194,10 @@ impl Mlp {
                 format!("{inputs} channels, and at least two widths, would fit"),
             );
         }
+        if let Some(layer) = self.spec.skip.iter().find(|layer| **layer >= self.layers()) {
+            let problem = format!("layer {layer} sees the input again, but there are {} layers", self.layers());
+            return Tensor::misfit("mlp", &[x], problem, "layers are counted from 0");
+        }
         let x = x.reshape(inputs);
         let mut hidden = x.clone();
         for layer in 0..self.layers() {

@@ -63,7 +63,10 @@ impl Tensor {
         let (shape, error) = match (poisoned, found) {
             (Some(e), Ok(shape)) => (shape, Some(e)),
             (Some(e), Err(_)) => (Shape::new(&[], 1), Some(e)),
-            (None, Ok(shape)) => (shape, name_clash(&op, &inputs, source)),
+            (None, Ok(shape)) => {
+                let clash = name_clash(&op, &inputs, &shape, source);
+                (shape, clash)
+            }
             (None, Err(m)) => (Shape::new(&[], 1), Some(Arc::new(record_error(&op, &inputs, m, source)))),
         };
         let id = NEXT.fetch_add(1, Ordering::Relaxed);
@@ -144,15 +147,20 @@ fn record_error(op: &Arc<dyn Op>, inputs: &[Tensor], m: Misfit, source: &'static
 }
 
 /// Two different axes of one name in one op are nearly always a mistake: the user made the axis twice.
-fn name_clash(op: &Arc<dyn Op>, inputs: &[Tensor], source: &'static Location<'static>) -> Option<Arc<RecordError>> {
+fn name_clash(
+    op: &Arc<dyn Op>,
+    inputs: &[Tensor],
+    result: &Shape,
+    source: &'static Location<'static>,
+) -> Option<Arc<RecordError>> {
     let mut seen: Vec<&Axis> = vec![];
-    for a in inputs.iter().flat_map(|t| t.axes()) {
+    for a in inputs.iter().flat_map(|t| t.axes()).chain(&result.axes) {
         match seen.iter().find(|b| b.name() == a.name()) {
             Some(b) if *b != a => {
                 let problem = if a.size() == b.size() {
                     format!("two different axes are called `{}`", a.name())
                 } else {
-                    format!("axis `{}` has size {} in one operand and {} in another", a.name(), b.size(), a.size())
+                    format!("axis `{}` has size {} in one place and {} in another", a.name(), b.size(), a.size())
                 };
                 let m = Misfit::new(
                     problem,

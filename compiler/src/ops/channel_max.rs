@@ -53,10 +53,11 @@ impl Tensor {
     #[track_caller]
     pub fn argmax_channels(&self) -> Tensor {
         // Not the channel that equals the maximum: a value computed twice may differ in its rounding.
-        let mut most = self.ch(0);
+        let number = self.equal(self).select(self, &Tensor::scalar(f64::from(f32::MIN)));
+        let mut most = number.ch(0);
         let mut at = most.less_than(&most);
         for c in 1..self.width() {
-            let next = self.ch(c);
+            let next = number.ch(c);
             let above = most.less_than(&next);
             at = above.select(&Tensor::integers(&[c as u32]), &at);
             most = above.select(&next, &most);

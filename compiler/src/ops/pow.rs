@@ -36,6 +36,9 @@ impl Pointwise for Pow {
         let log = b.emit(Prim::Log, &[a[0]]);
         let z = b.emit(Prim::Mul, &[a[1], log]);
         let power = b.emit(Prim::Exp, &[z]);
+        // Drivers take e^(2 log x) for x^2; the logarithm alone stays what it is.
+        let defined = b.emit(Prim::Le, &[b.f(0.0), a[0]]);
+        let power = b.emit(Prim::Select, &[defined, power, log]);
         let none = b.emit(Prim::Eq, &[a[1], b.f(0.0)]);
         b.emit(Prim::Select, &[none, b.f(1.0), power])
     }

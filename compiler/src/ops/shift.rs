@@ -42,7 +42,8 @@ impl Tensor {
     /// The element `by` places earlier along `axis` (later if negative), 0 where there is none.
     #[track_caller]
     pub fn shift(&self, axis: &Axis, by: i64) -> Tensor {
-        Tensor::record(Shift { axis: axis.clone(), by }, &[self])
+        let size = axis.size() as i64;
+        Tensor::record(Shift { axis: axis.clone(), by: by.clamp(-size, size) }, &[self])
     }
 }
 
@@ -52,6 +53,10 @@ pub fn samples() -> Vec<Sample> {
     let (r, s) = (ray.clone(), sample.clone());
     vec![
         Sample::new("shift", x(), move |x| x[0].shift(&s, 2)),
+        Sample::new("shift beyond the end", x(), {
+            let s = sample.clone();
+            move |x| x[0].shift(&s, i64::MIN) + x[0].shift(&s, (1 << 33) + 1) + x[0].shift(&s, i64::MAX) + &x[0]
+        }),
         Sample::new("shift back, outer axis", x(), move |x| x[0].shift(&r, -1)),
     ]
 }

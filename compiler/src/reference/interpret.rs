@@ -15,6 +15,8 @@ pub enum EvalError {
     Unbound { name: String, shape: Box<Shape> },
     #[error("input `{name}` is {expected}, but the value given is {found}")]
     Shape { name: String, expected: Box<Shape>, found: Box<Shape> },
+    #[error("central differences by `{name}`: {problem}")]
+    Difference { name: String, problem: String },
 }
 
 /// Values of `roots`, given the values of the inputs they depend on.

@@ -1,6 +1,6 @@
 //! What papers call a run: its method, its scene, and where its poses started.
 
-use super::{CodeKind, Encoding, FieldKind, Layered, Method, NoiseKind, Origin, SceneSettings, Settings};
+use super::{CodeKind, Dof, Encoding, FieldKind, ImageSize, Layered, Method, NoiseKind, Origin, SceneSettings, Settings};
 use crate::scene::Layout;
 use std::path::Path;
 
@@ -54,7 +54,7 @@ impl Settings {
         let of_scene = self.scene.as_ref().map(|s| (s.poses_in(s.layout()), noise.kind));
         match of_scene {
             None if self.warp.method == Method::None => None,
-            None => Some(format!("homography {}, translation {}", noise.homography, noise.translation)),
+            None => Some(self.patches_name()),
             Some(("truth", _)) if self.warp.method == Method::None => None,
             Some(("truth", _)) => Some("truth".to_string()),
             Some(("identity", _)) => Some("identity".to_string()),
@@ -64,6 +64,22 @@ impl Settings {
             Some((path, _)) if path.ends_with(".json") => Some("file".to_string()),
             Some(_) => Some("colmap".to_string()),
         }
+    }
+
+    /// Where patches started, and what else an error in pixels hangs on where it is not as published.
+    fn patches_name(&self) -> String {
+        let (data, noise) = (&self.data, &self.noise);
+        let mut name = format!("homography {}, translation {}", noise.homography, noise.translation);
+        let published = data.image_size == ImageSize::Photo || data.image_size == ImageSize::Fixed([360, 480]);
+        let others = [
+            (!published || data.patch_crop != [180, 180], "another size"),
+            (self.warp.dof != Dof::Homography, "a smaller group"),
+            (data.perturbation != "drawn", "a file"),
+        ];
+        for (_, other) in others.into_iter().filter(|(is, _)| *is) {
+            name += &format!(", {other}");
+        }
+        name
     }
 
     /// Whether poses are disturbed as much as the L2G-NeRF paper disturbed those of this scene.

@@ -55,11 +55,12 @@ impl Sweep {
         let bases = bases(presets)?;
         let names: Vec<&str> = bases.iter().map(|b| b.name.as_str()).collect();
         // What is set for one preset wins over what is set for all, and of either what holds for some scenes over what holds for all.
-        rest.sort_by_key(|l| {
+        let when = |l: &Leaf| {
             let of_preset = |name: &&str| l.key.strip_prefix("preset.")?.strip_prefix(name)?.strip_prefix('.');
             let key = l.key.strip_prefix("set.").or_else(|| names.iter().find_map(of_preset)).unwrap_or_default();
-            (!l.key.starts_with("set."), When::split(key).0 != When::Always)
-        });
+            When::split(key).0
+        };
+        rest.sort_by_key(|l| (!l.key.starts_with("set."), when(l) != When::Always));
         let of_preset = |layered: Layered| rest.iter().try_fold(layered, |l, leaf| set(l, leaf, &names));
         let bases = bases.iter().cloned().map(of_preset).collect::<Result<Vec<Layered>, _>>()?;
         let scenes = values(list("scenes"), "the names of folders or photos", Value::is_str)?;
@@ -78,6 +79,16 @@ impl Sweep {
                     }
                     cells.push(cell);
                 }
+            }
+        }
+        let scenes: Vec<String> = cells.iter().map(|c| c.layered.settings.scene_name()).collect();
+        for leaf in &rest {
+            if let When::On(scene) = when(leaf)
+                && !scenes.contains(&scene)
+            {
+                let meant = nearest(&scene, scenes.iter().map(String::as_str));
+                let meant = meant.map_or(String::new(), |n| format!("; did you mean `{n}`?"));
+                return Err(refuse(leaf, format!("no scene of this sweep is called `{scene}`{meant}")));
             }
         }
         let name = path.file_stem().map_or(String::new(), |s| s.to_string_lossy().into_owned());
@@ -225,7 +236,7 @@ mod tests {
         };
         let (all, some) = ("[set.optim]\nsteps = 30\n", "[set.on.builtin.optim]\nsteps = 20\n");
         assert_eq!(steps(&format!("{all}{some}")), [20, 20]);
-        assert_eq!(steps(&format!("{some}{all}[set.on.fern.optim]\nsteps = 7\n")), [20, 20]);
+        assert_eq!(steps(&format!("{some}{all}")), [20, 20]);
         let one = "[preset.l2g-small.optim]\nsteps = 10\n";
         assert_eq!(steps(&format!("{one}{some}{all}")), [20, 10]);
         assert_eq!(steps(&format!("[preset.l2g-small.on.builtin.optim]\nsteps = 9\n{one}{all}")), [30, 9]);
@@ -235,6 +246,10 @@ mod tests {
     fn bad_files_are_refused_with_line_and_field() {
         for (text, expected) in [
             ("seeds = [1]\n", &["missing `presets`"][..]),
+            (
+                "presets = [\"barf-small\"]\n[set.on.builtn.optim]\nlr = 1e-3\n",
+                &["grid.toml:3", "no scene of this sweep is called `builtn`; did you mean `builtin`?"],
+            ),
             ("presets = []\n", &["grid.toml:1: `presets`", "expected a list of names of presets or files"]),
             ("presets = [\"barf-smal\"]\n", &["grid.toml:1: `presets`", "did you mean `barf-small`?"]),
             ("presets = [\"mine.toml\"]\n", &["grid.toml:1: `presets`", "mine.toml"]),

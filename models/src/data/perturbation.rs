@@ -16,6 +16,9 @@ use std::path::{Path, PathBuf};
 /// Redraws of one patch before the noise is declared too large for the image.
 const ATTEMPTS: usize = 1_000_000;
 
+/// More than any number of a file may be: a half length or a radian is 1.
+const LARGEST: f64 = 100.0;
+
 /// Distortions of all patches.
 #[derive(Clone, Debug, PartialEq, Default, Serialize, Deserialize)]
 pub struct Perturbation {
@@ -38,6 +41,9 @@ struct File {
     dof: Option<u64>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     seed: Option<i64>,
+    /// What tells the picture that the patches are cut from from others.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    photo_blake3: Option<String>,
     perturbation: Perturbation,
 }
 
@@ -101,6 +107,7 @@ impl Perturbation {
             field if field == "." => format(e.inner().to_string()),
             field => format(format!("`{field}`: {}", e.inner())),
         })?;
+        json.end().map_err(|e| format(e.to_string()))?;
         let size = |s: [usize; 2]| format!("{} x {}", s[0], s[1]);
         let sets = |key: &str, s: [usize; 2]| format!("; `--set {key}=[{},{}]` would fit", s[0], s[1]);
         let mismatch = |what, found: String, expected: String, hint: String| {
@@ -123,16 +130,13 @@ impl Perturbation {
                 return mismatch("a number of patches of", len.to_string(), settings.data.patches.to_string(), hint);
             }
         }
-        let finite = |x: &f64| x.is_finite();
-        if !p
-            .homography
-            .iter()
-            .flatten()
-            .chain(p.rotation.iter().flatten())
-            .chain(p.translation.iter().flatten())
-            .all(finite)
-        {
-            return Err(format("a number is not finite".to_string()));
+        let all = p.homography.iter().flatten().chain(p.rotation.iter().flatten()).chain(p.translation.iter().flatten());
+        if let Some(x) = all.into_iter().find(|x| x.is_nan() || x.abs() > LARGEST) {
+            return Err(format(format!("expected numbers of at most {LARGEST}, found {x:e}")));
+        }
+        if settings.warp.fix_first && p.transforms().first().is_some_and(|t| *t != Transform::identity()) {
+            let text = "patch 0 is to stay where it is (`warp.fix_first`), so all its numbers should be 0";
+            return Err(format(format!("{text}; `--set warp.fix_first=false` trains it too")));
         }
         if let Some((i, _)) = p.transforms().iter().enumerate().find(|(_, t)| !inside(grid, t)) {
             return Err(format(format!("patch {i} does not stay inside the image")));
@@ -140,14 +144,28 @@ impl Perturbation {
         Ok(p)
     }
 
-    /// The file that loads as this perturbation.
-    pub fn to_json(&self, settings: &Settings, grid: &Grid) -> String {
+    /// The perturbation in a file of [`Perturbation::to_json`], and the digest of the photo; nothing if it cannot be read.
+    pub fn kept(path: &Path) -> Option<(Perturbation, Option<String>)> {
+        let file: File = serde_json::from_str(&std::fs::read_to_string(path).ok()?).ok()?;
+        Some((file.perturbation, file.photo_blake3))
+    }
+
+    /// Whether all numbers are the same but for what writing them takes.
+    pub fn is_near(&self, other: &Perturbation) -> bool {
+        let numbers = |p: &Perturbation| [p.homography.concat(), p.rotation.concat(), p.translation.concat()].concat();
+        let (a, b) = (numbers(self), numbers(other));
+        a.len() == b.len() && a.iter().zip(&b).all(|(a, b)| (a - b).abs() <= 1e-9)
+    }
+
+    /// The file that loads as this perturbation, with the digest of the photo if it is known.
+    pub fn to_json(&self, settings: &Settings, grid: &Grid, photo: Option<String>) -> String {
         let file = File {
             image_size_hw: [grid.height, grid.width],
             patch_crop_hw: grid.crop,
             warp: Some(settings.warp.dof.to_string()),
             dof: Some(settings.warp.dof.into()),
             seed: (settings.data.perturbation == "drawn").then_some(i64::from(settings.run.seed)),
+            photo_blake3: photo,
             perturbation: self.clone(),
         };
         // A struct of numbers and strings always has a JSON form.
@@ -240,12 +258,32 @@ mod tests {
             assert!(p.transforms().iter().all(|t| inside(&CAT, t)));
             let dir = tempfile::tempdir().unwrap();
             let path = dir.path().join("perturbation.json");
-            std::fs::write(&path, p.to_json(&settings, &CAT)).unwrap();
+            std::fs::write(&path, p.to_json(&settings, &CAT, None)).unwrap();
             assert_eq!(Perturbation::load(&path, &settings, &CAT).unwrap(), p);
             let smaller = Grid { crop: [100, 100], ..CAT };
             let error = Perturbation::load(&path, &settings, &smaller).unwrap_err().to_string();
             assert!(error.contains("patches of 180 x 180, but this experiment has 100 x 100"), "{error}");
         }
+    }
+
+    #[test]
+    fn files_of_nonsense_are_refused() {
+        let settings = Layered::load("planar-l2g").unwrap().settings;
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("perturbation.json");
+        let good = Perturbation::of(&settings, &CAT).unwrap();
+        let refused = |p: &Perturbation, more: &str, part: &str| {
+            std::fs::write(&path, p.to_json(&settings, &CAT, None) + more).unwrap();
+            let error = Perturbation::load(&path, &settings, &CAT).unwrap_err().to_string();
+            assert!(error.contains(part), "{error}");
+        };
+        refused(&good, "]", "trailing characters");
+        let mut huge = good.clone();
+        huge.homography[1] = [1e100; 8];
+        refused(&huge, "", "expected numbers of at most 100, found 1e100");
+        let mut moved = good.clone();
+        moved.translation[0] = [0.1, 0.0];
+        refused(&moved, "", "patch 0 is to stay where it is");
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Photos: loading, and sampling at warped coordinates.
 
-use image::{DynamicImage, ImageReader};
+use crate::scene::jpeg;
+use image::{DynamicImage, ImageDecoder, ImageReader};
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
@@ -22,6 +23,8 @@ pub enum PhotoError {
     Read { path: PathBuf, source: std::io::Error },
     #[error("{} is not a readable PNG or JPEG image: {source}", .path.display())]
     Decode { path: PathBuf, source: image::ImageError },
+    #[error("{}: a damaged JPEG image: {damage}", .path.display())]
+    Damaged { path: PathBuf, damage: String },
     #[error(
         "the image {} has {width} x {height} pixels (width x height), fewer than the patches of {} x {}",
         .path.display(), .crop[1], .crop[0]
@@ -30,19 +33,38 @@ pub enum PhotoError {
 }
 
 impl Photo {
-    /// Loads a file, or the built-in photo for `builtin`.
+    /// Loads a file, turned as its EXIF data say, or the built-in photo for `builtin`. Transparency is not looked at.
     pub fn load(image: &str) -> Result<Photo, PhotoError> {
         let path = Path::new(image);
         let bytes = match image {
             "builtin" => BUILTIN.to_vec(),
             _ => std::fs::read(path).map_err(|source| PhotoError::Read { path: path.into(), source })?,
         };
-        let decode = |bytes| ImageReader::new(Cursor::new(bytes)).with_guessed_format()?.decode();
+        if let Some(damage) = jpeg::damage(&bytes) {
+            return Err(PhotoError::Damaged { path: path.into(), damage });
+        }
+        let decode = |bytes| {
+            let mut decoder = ImageReader::new(Cursor::new(bytes)).with_guessed_format()?.into_decoder()?;
+            let turn = decoder.orientation()?;
+            let mut decoded = DynamicImage::from_decoder(decoder)?;
+            decoded.apply_orientation(turn);
+            Ok(decoded)
+        };
         let decoded: Result<DynamicImage, image::ImageError> = decode(bytes);
         let rgb = decoded.map_err(|source| PhotoError::Decode { path: path.into(), source })?.to_rgb8();
         let (width, height) = (rgb.width() as usize, rgb.height() as usize);
         let rgb = rgb.pixels().map(|p| p.0.map(|byte| f32::from(byte) / 255.0)).collect();
         Ok(Photo { height, width, rgb })
+    }
+
+    /// What tells its pixels from others: BLAKE3 in hexadecimal digits.
+    pub fn digest(&self) -> String {
+        let mut hasher = blake3::Hasher::new();
+        for rgb in &self.rgb {
+            hasher.update(&rgb.map(|x| (x * 255.0).round() as u8));
+        }
+        hasher.update(&(self.width as u64).to_le_bytes());
+        hasher.finalize().to_hex().to_string()
     }
 
     /// Refuses a photo that is smaller than the patches (rows, columns) to be cut from it.
@@ -81,6 +103,20 @@ impl Photo {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn cut_photos_are_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("photo.jpg");
+        let image = image::RgbImage::from_fn(64, 48, |x, y| image::Rgb([x as u8, y as u8, (x * y) as u8]));
+        image.save(&path).unwrap();
+        let whole = Photo::load(&path.to_string_lossy()).unwrap();
+        assert_eq!((whole.width, whole.height), (64, 48));
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+        let error = Photo::load(&path.to_string_lossy()).unwrap_err().to_string();
+        assert!(error.contains("photo.jpg: a damaged JPEG image"), "{error}");
+    }
 
     #[test]
     fn the_builtin_photo_loads_and_samples_at_pixel_centres() {

@@ -5,6 +5,6 @@ pub mod data;
 pub mod model;
 pub mod trainer;
 
-pub use data::{DataError, PlanarData};
+pub use data::{DataError, PERTURBATION, PlanarData};
 pub use model::{PlanarModel, weights};
 pub use trainer::{Evaluation, Trainer};

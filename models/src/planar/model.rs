@@ -91,7 +91,7 @@ impl PlanarModel {
     pub fn train_step(&self) -> Step {
         let (at, target) = match self.settings.data.points_per_patch {
             Count::All => (self.all_points(), self.target()),
-            Count::Of(points) => self.drawn_points(points),
+            Count::Of(_) => self.drawn_points(self.points_per_patch()),
         };
         let (found, render) = self.losses(&at, &target);
         let total = self.total(&found, &render);
@@ -134,14 +134,13 @@ impl PlanarModel {
             _ => render.clone(),
         };
         match &found.penalty {
-            Some((penalty, weight)) if *weight > 0.0 => aligned + penalty * *weight,
+            Some((penalty, weight)) if *weight != 0.0 => aligned + penalty * *weight,
             _ => aligned,
         }
     }
     fn register(&self, at: &Points) -> Registration {
-        let none = Tensor::scalar(0.0);
-        let code = self.code.as_ref().map_or(&none, |c| &c.tensor);
-        Registration::new(&*self.warp, at, None, code, self.settings.warp.fix_first)
+        let code = warps::code_tensor(self.code.as_ref());
+        Registration::new(&*self.warp, at, None, &code, self.settings.warp.fix_first)
     }
     fn all_points(&self) -> Points {
         let xy = Tensor::data(GRID, Shape::new(&[&self.pixel], 2));
@@ -174,6 +173,7 @@ impl PlanarModel {
         if let Some(code) = self.code.as_ref().filter(|_| held) {
             optimise::hold_first(&mut updates, &code.tensor, &self.frame);
         }
+        optimise::keep_averages(&mut updates, &self.parameters(), &self.settings.optim);
         updates
     }
 }

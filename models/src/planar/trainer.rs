@@ -161,6 +161,7 @@ impl Training for Trainer {
         watch: Watch,
     ) -> Result<(), Error> {
         watch.check()?;
+        self.settle()?;
         let found = self.evaluate()?;
         let warps = found.warps.iter().map(|w| std::array::from_fn(|i| w.0[(i / 3, i % 3)])).collect();
         metrics.last = Some(Final { entry: found.entry.clone(), seconds: seconds(), warps });

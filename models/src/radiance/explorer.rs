@@ -26,6 +26,8 @@ use std::sync::Arc;
 const VIEW_PIXELS: usize = 2048;
 /// Points that one run of the density program covers.
 const PLACES: usize = 16384;
+/// Pixels along a side of the grid on which the poses of averages are fitted, where `train.fit_grid` names none.
+const FITTED: usize = 24;
 
 /// A model in training.
 pub struct Explorer {
@@ -92,7 +94,7 @@ impl Explorer {
         // From here on the images live on the device.
         for (i, view) in data.scene.train.iter_mut().enumerate() {
             let pixels: Vec<u32> = model::packed(view).collect();
-            learner.session.set_u32_from(model::IMAGES, i * pixels.len(), &pixels)?;
+            learner.set_u32_from(model::IMAGES, i * pixels.len(), &pixels)?;
             (view.pixels, view.depth, view.mask) = (vec![], None, None);
             photos.extend(relocalises.then_some(pixels));
         }
@@ -123,23 +125,6 @@ impl Explorer {
         let (rough, found) = (self.learner.session.get(model::POSES)?, self.learner.session.get(model::FOUND)?);
         let one = |(rough, found)| Pose::from_rows::<f32>(rough).after(&Pose::from_rows(found));
         Ok(rough.chunks(12).zip(found.chunks(12)).map(one).collect())
-    }
-
-    /// Fits the poses of the training views once more, at pixels of a grid, where `train.fit_grid` asks for that: the last
-    /// step's hang on the pixels that it drew. To be called when nothing is trained any more.
-    pub fn settle(&mut self) -> Result<(), Error> {
-        let side = self.settings.train.as_ref().map_or(0, |t| t.fit_grid);
-        if side == 0 {
-            return Ok(());
-        }
-        let pixels = self.data.size.grid(side);
-        let program = match self.fit {
-            Some(program) => program,
-            None => self.learner.add(&self.model.fit(pixels.len()))?,
-        };
-        self.fit = Some(program);
-        self.learner.set_u32(model::FIT_PIXELS, &pixels)?;
-        self.learner.run(program)
     }
 
     /// What was found of the lenses, where they are refined.
@@ -353,6 +338,27 @@ impl Training for Explorer {
         let (samples, fine) = self.settings.train.as_ref().map_or((0, 0), |t| (t.samples, t.fine_samples));
         let more = if fine > 0 { format!(" + {fine}") } else { String::new() };
         format!("{} rays of {samples}{more} samples", self.rays)
+    }
+    /// Takes the averages where `optim.average` has kept some, and fits the poses of the training views once more, at pixels of
+    /// a grid, where `train.fit_grid` asks for that: the last step's hang on the pixels that it drew. Averages have poses of
+    /// their own, which are fitted in any case. To be called when nothing is trained any more.
+    fn settle(&mut self) -> Result<(), Error> {
+        let averaged = self.learner.take_averages()?;
+        let side = match self.settings.train.as_ref().map_or(0, |t| t.fit_grid) {
+            0 if averaged => FITTED,
+            side => side,
+        };
+        if side == 0 {
+            return Ok(());
+        }
+        let pixels = self.data.size.grid(side);
+        let program = match self.fit {
+            Some(program) => program,
+            None => self.learner.add(&self.model.fit(pixels.len()))?,
+        };
+        self.fit = Some(program);
+        self.learner.set_u32(model::FIT_PIXELS, &pixels)?;
+        self.learner.run(program)
     }
     fn write_data(&self, folder: &RunFolder) -> Result<(), Error> {
         results::write_data(folder, &self.data)

@@ -18,7 +18,7 @@ use super::rays::{Cameras, ImageSize, Rays, range_of};
 use super::rendering::{Purpose, Rendering, Seen};
 use crate::config::{DepthSettings, RadianceSettings, SceneSettings, Settings, TrainSettings};
 use crate::scene::View;
-use crate::training::optimise::{STEP, hold_first, scales_loss, update_of, updates};
+use crate::training::optimise::{STEP, hold_first, keep_averages, scales_loss, update_of, updates};
 use crate::warps::{self, Registration, Warp};
 use raygrad_compiler::functions::adam::StepScalars;
 use raygrad_compiler::functions::lie::se3_exp;
@@ -186,7 +186,7 @@ impl RadianceModel {
             _ => both,
         };
         let total = match &found.penalty {
-            Some((penalty, weight)) if *weight > 0.0 => aligned + penalty * *weight,
+            Some((penalty, weight)) if *weight != 0.0 => aligned + penalty * *weight,
             _ => aligned,
         };
         let transform = self.along_frames(&found.transform);
@@ -200,6 +200,7 @@ impl RadianceModel {
         if let (true, Some(code)) = (pinned, &self.code) {
             hold_first(&mut updates, &code.tensor, &self.frame);
         }
+        keep_averages(&mut updates, &self.parameters(), &self.settings.optim);
         updates.push((known, transform));
         updates.extend(map.map(|map| map.updated(&seen.best().color, colors)));
         Step { outputs, updates }
@@ -208,10 +209,9 @@ impl RadianceModel {
     /// Where the warp as it is moves the pixels `index` along `ray` of the training views, and their centres.
     fn registered(&self, ray: &Axis, index: &Tensor) -> Registration {
         let cameras = Cameras::new(&self.frame, ray, index, self.size, &self.intrinsics(), &self.rough_poses());
-        let none = Tensor::scalar(0.0);
-        let code = self.code.as_ref().map_or(&none, |c| &c.tensor);
+        let code = warps::code_tensor(self.code.as_ref());
         let pinned = self.settings.warp.fix_first;
-        Registration::new(&*self.warp, &cameras.pixels, Some(&cameras.centers), code, pinned)
+        Registration::new(&*self.warp, &cameras.pixels, Some(&cameras.centers), &code, pinned)
     }
 
     /// The poses of the training views fitted once more, at the pixels [`FIT_PIXELS`], so many of them in every view: an update of

@@ -8,7 +8,7 @@ use crate::config::{Layered, Settings};
 use crate::evaluation::{self, Measured, Scores, ViewScores, success_px};
 use crate::geometry::Grid;
 use crate::pictures::{self, Canvas};
-use crate::planar::{Evaluation, PlanarData, Trainer};
+use crate::planar::{Evaluation, PERTURBATION, PlanarData, Trainer};
 use crate::report::{Picture, Report};
 use crate::training::Training;
 
@@ -17,7 +17,7 @@ pub(crate) const FRAMES: &str = "frames";
 
 /// What the run learns from, before it begins.
 pub fn write_data(folder: &RunFolder, settings: &Settings, data: &PlanarData) -> Result<(), Error> {
-    folder.write("perturbation.json", data.perturbation.to_json(settings, &data.grid).as_bytes())?;
+    folder.write(PERTURBATION, data.to_json(settings).as_bytes())?;
     let colors: Vec<f32> = data.targets().concat().iter().map(|c| *c as f32).collect();
     folder.write("patches.png", &pictures::patch_row(&data.grid, &colors).to_png()?)?;
     Ok(())

@@ -34,8 +34,11 @@ struct Band {
     progressive: bool,
 }
 
-/// What is wrong with an image.
-pub(super) fn damage(bytes: &[u8]) -> Option<String> {
+/// What is wrong with an image, if it is of this format.
+pub(crate) fn damage(bytes: &[u8]) -> Option<String> {
+    if !bytes.starts_with(&[0xff, 0xd8]) {
+        return None;
+    }
     Reader { bytes, at: 2, ..Reader::default() }.image().err()
 }
 

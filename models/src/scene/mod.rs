@@ -13,7 +13,7 @@ mod dtu;
 mod error;
 mod folder;
 mod frame;
-mod jpeg;
+pub(crate) mod jpeg;
 mod json;
 mod llff;
 pub mod make_scene;

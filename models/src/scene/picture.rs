@@ -83,9 +83,7 @@ fn decode_error(path: &Path, source: image::ImageError) -> SceneError {
 
 fn decode(path: &Path) -> Result<DynamicImage, SceneError> {
     let bytes = std::fs::read(path).map_err(|source| SceneError::Read { path: path.into(), source })?;
-    if bytes.starts_with(&[0xff, 0xd8])
-        && let Some(damage) = jpeg::damage(&bytes)
-    {
+    if let Some(damage) = jpeg::damage(&bytes) {
         return Err(SceneError::Format { path: path.into(), message: format!("a damaged JPEG image: {damage}") });
     }
     let reader = ImageReader::new(std::io::Cursor::new(bytes)).with_guessed_format();

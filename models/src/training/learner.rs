@@ -1,6 +1,6 @@
 //! A device with the programs of an experiment, their inputs, and the count of steps.
 
-use super::optimise::{Rates, STEP};
+use super::optimise::{AVERAGE_OF, Rates, STEP};
 use crate::Error;
 use crate::config::{Networks, Optim, Settings};
 use crate::data::initial_values;
@@ -9,7 +9,7 @@ use raygrad_compiler::functions::mlp::Parameter;
 use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::{Channels, Program, Shape, Step, Target, compile, cost};
 use raygrad_runtime::{Device, InputInfo, ProgramId, Session};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// How many times as fast networks layer by layer should be, as predicted, before they are chosen untried: on an H100 resident
 /// ones were the faster ones in all that was measured, also where they were predicted to take 1.04 times as long.
@@ -55,6 +55,8 @@ pub struct Learner {
     autotune: bool,
     optim: Optim,
     inputs: BTreeMap<String, InputInfo>,
+    /// Inputs that were set.
+    given: BTreeSet<String>,
     step: usize,
     /// Whether a training program's outputs are of the present state: a step was done since it began or was restored.
     stepped: bool,
@@ -70,8 +72,8 @@ impl Learner {
         };
         let (session, optim) = (Session::new(device.clone())?, settings.optim.clone());
         let (networks, autotune) = (settings.run.networks, settings.run.autotune);
-        let inputs = BTreeMap::new();
-        let mut learner = Learner { session, device, networks, autotune, optim, inputs, step: 0, stepped: false };
+        let (inputs, given) = (BTreeMap::new(), BTreeSet::new());
+        let mut learner = Learner { session, device, networks, autotune, optim, inputs, given, step: 0, stepped: false };
         let program = learner.add(step)?;
         Ok((learner, program))
     }
@@ -107,6 +109,7 @@ impl Learner {
     pub fn set(&mut self, name: &str, values: &[f32]) -> Result<(), Error> {
         if self.has(name) {
             self.session.set(name, values)?;
+            self.given.insert(name.to_string());
         }
         Ok(())
     }
@@ -115,7 +118,15 @@ impl Learner {
     pub fn set_u32(&mut self, name: &str, values: &[u32]) -> Result<(), Error> {
         if self.has(name) {
             self.session.set_u32(name, values)?;
+            self.given.insert(name.to_string());
         }
+        Ok(())
+    }
+
+    /// Sets some elements of an input of whole numbers and one channel, from element `first` on.
+    pub fn set_u32_from(&mut self, name: &str, first: usize, values: &[u32]) -> Result<(), Error> {
+        self.session.set_u32_from(name, first, values)?;
+        self.given.insert(name.to_string());
         Ok(())
     }
 
@@ -151,8 +162,18 @@ impl Learner {
     }
 
     /// One step of the training program.
+    ///
+    /// # Errors
+    /// If it fails, or the program has an input that was never set.
     pub fn train(&mut self, program: ProgramId) -> Result<(), Error> {
         self.set_rates()?;
+        if !self.stepped {
+            let from_host = |role| matches!(role, Role::Data | Role::PerStep);
+            let mut all = self.session.program(program).inputs();
+            if let Some((name, ..)) = all.find(|(name, role, _)| from_host(*role) && !self.given.contains(*name)) {
+                return Err(Error::UnsetInput { name: name.to_string() });
+            }
+        }
         self.session.run(program)?;
         self.step += 1;
         self.stepped = true;
@@ -173,6 +194,22 @@ impl Learner {
     /// Whether the outputs of the training program are those of the step that led to the present state.
     pub fn has_stepped(&self) -> bool {
         self.stepped
+    }
+
+    /// Gives everything trained the average that was kept of it; whether there were any.
+    pub fn take_averages(&mut self) -> Result<bool, Error> {
+        let kept = |(name, info): (&String, &InputInfo)| {
+            (info.role == Role::State).then(|| name.strip_prefix(AVERAGE_OF).map(str::to_string)).flatten()
+        };
+        let kept: Vec<String> = self.inputs.iter().filter_map(kept).collect();
+        if self.step == 0 || kept.is_empty() {
+            return Ok(false);
+        }
+        for name in kept {
+            let average = self.session.get(&format!("{AVERAGE_OF}{name}"))?;
+            self.session.set(&name, &average)?;
+        }
+        Ok(true)
     }
 
     /// Runs a program that trains nothing, at the current progress.

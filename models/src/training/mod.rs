@@ -39,6 +39,11 @@ pub trait Training {
         self.learner_mut().train(program)
     }
 
+    /// Takes the averages where `optim.average` has kept some. To be called when nothing is trained any more.
+    fn settle(&mut self) -> Result<(), Error> {
+        self.learner_mut().take_averages().map(drop)
+    }
+
     /// Losses and errors of the last step, as its forward pass saw them.
     fn measure(&mut self) -> Result<Entry, Error>;
 

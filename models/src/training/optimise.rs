@@ -11,6 +11,7 @@ use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::functions::adam::{Adam, Moments, StepScalars};
 use raygrad_compiler::functions::mlp::Parameter;
 use raygrad_compiler::fuse::TargetKind;
+use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::{Axis, Shape, Tensor};
 
 pub const STEP: &str = "step";
@@ -19,6 +20,10 @@ pub const LR_FIELD: &str = "lr.field";
 pub const LR_WARP: &str = "lr.warp";
 pub const BIAS1: &str = "adam.bias1";
 pub const BIAS2: &str = "adam.bias2";
+/// How fast the averages follow what is trained.
+pub const AVERAGE: &str = "average";
+/// How the average of a parameter is called: this and its name.
+pub const AVERAGE_OF: &str = "average.";
 
 /// Values of step `it`, counted from 0.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -28,6 +33,7 @@ pub struct Rates {
     pub lr_warp: f64,
     pub bias1: f64,
     pub bias2: f64,
+    pub average: f64,
 }
 
 impl Rates {
@@ -42,23 +48,26 @@ impl Rates {
             lr_warp: decayed(optim.lr_warp, optim.lr_warp_end) * warm,
             bias1,
             bias2,
+            // A mean of all steps so far, until they are as many as it is to remember.
+            average: 1.0 / (it + 1).min(optim.average.max(1)) as f64,
         }
     }
 
     /// Names and values of the inputs they are.
-    pub fn inputs(&self) -> [(&'static str, f64); 5] {
+    pub fn inputs(&self) -> [(&'static str, f64); 6] {
         [
             (PROGRESS, self.progress),
             (LR_FIELD, self.lr_field),
             (LR_WARP, self.lr_warp),
             (BIAS1, self.bias1),
             (BIAS2, self.bias2),
+            (AVERAGE, self.average),
         ]
     }
 }
 
 /// Inputs with what they become.
-type Updates = Vec<(Tensor, Tensor)>;
+pub type Updates = Vec<(Tensor, Tensor)>;
 
 /// Whether a step of this precision scales its loss: the halves of a GPU (f16) end at 65504, those of the CPU (bfloat16) have
 /// the exponents of single precision.
@@ -107,10 +116,72 @@ pub fn updates(total: &Tensor, field: &[Parameter], warp: &[Parameter], scaled: 
     updates
 }
 
+/// Keeps averages of all `parameters` beside them, where `optim.average` asks for that: states [`AVERAGE_OF`] their names, which
+/// follow the values that `updates` gives them (Polyak and Juditsky 1992; here exponential).
+pub fn keep_averages(updates: &mut Updates, parameters: &[Parameter], optim: &Optim) {
+    if optim.average == 0 {
+        return;
+    }
+    let rate = Tensor::per_step(AVERAGE, Shape::new(&[], 1));
+    let of = |(input, value): &(Tensor, Tensor)| {
+        let parameter = parameters.iter().find(|p| p.tensor.id() == input.id())?;
+        let name = format!("{AVERAGE_OF}{}", parameter.tensor.input_name()?);
+        let average = Tensor::input(name, Role::State, input.shape().clone());
+        let follows = &average + (value - &average) * &rate;
+        Some((average, follows))
+    };
+    let averages: Updates = updates.iter().filter_map(of).collect();
+    updates.extend(averages);
+}
+
 /// Makes the first frame's row of `parameter` zero after the step: it fixes the gauge. Its moments go on.
 pub fn hold_first(updates: &mut [(Tensor, Tensor)], parameter: &Tensor, frame: &Axis) {
     let first = Tensor::index(frame).equal(&Tensor::integers(&[0]));
     for (_, value) in updates.iter_mut().filter(|(input, _)| input.id() == parameter.id()) {
         *value = first.select(&Tensor::scalar(0.0), value);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Layered;
+    use raygrad_compiler::{Step, compile};
+    use raygrad_runtime::{Device, Session};
+
+    /// The mean of all steps while they are few, then one that forgets; of a parameter that is held, of what is held.
+    #[test]
+    fn averages_follow_what_is_trained() {
+        let frame = Axis::new("frame", 2);
+        let parameter = |name: &str, trained| Parameter {
+            tensor: Tensor::parameter(name, Shape::new(&[&frame], 1)),
+            init: raygrad_compiler::functions::mlp::Init::Zero,
+            trained,
+        };
+        let all = [parameter("p", true), parameter("still", false)];
+        let slope = Tensor::per_step("slope", Shape::new(&[], 1));
+        let loss = ((&all[0].tensor + &all[1].tensor) * slope).sum(&[&frame]);
+        let optim = Optim { average: 3, ..Layered::load("planar-l2g").unwrap().settings.optim };
+        let mut updates = updates(&loss, &all, &[], false);
+        hold_first(&mut updates, &all[0].tensor, &frame);
+        keep_averages(&mut updates, &all, &optim);
+        let device = Device::cpu(Some(1)).unwrap();
+        let mut session = Session::new(device.clone()).unwrap();
+        let program = session.add(compile(&Step { outputs: vec![], updates }, &device.target()).unwrap()).unwrap();
+        assert!(session.inputs().all(|(name, _)| name != "average.still"));
+        let mut expected = 0.0;
+        for it in 0..8 {
+            session.set("slope", &[(it as f32 - 3.5).sin()]).unwrap();
+            for (name, value) in Rates::at(&optim, it).inputs() {
+                if session.inputs().any(|(n, _)| n == name) {
+                    session.set(name, &[value as f32]).unwrap();
+                }
+            }
+            session.run(program).unwrap();
+            let (p, average) = (session.get("p").unwrap(), session.get("average.p").unwrap());
+            expected += (p[1] - expected) / (it + 1).min(3) as f32;
+            assert!(p[1] != 0.0 && (average[1] - expected).abs() < 1e-7, "{it}: {average:?}, {expected}");
+            assert_eq!((p[0], average[0]), (0.0, 0.0));
+        }
     }
 }

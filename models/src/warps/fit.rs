@@ -67,7 +67,7 @@ pub(super) fn affine(part: &Tensor, dof: Dof) -> Tensor {
 
 /// Sensor points under a global transform.
 #[track_caller]
-pub(super) fn move_by(dof: Dof, transform: &Tensor, points: &Tensor) -> Tensor {
+pub(crate) fn move_by(dof: Dof, transform: &Tensor, points: &Tensor) -> Tensor {
     match dof {
         Dof::Pose => apply_affine(&invert_pose(transform), points),
         _ => apply_homography(transform, points),

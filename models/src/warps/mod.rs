@@ -12,7 +12,7 @@ mod local;
 mod plain;
 
 pub use fit::fit_global;
-use fit::move_by;
+pub(crate) use fit::move_by;
 pub use global::GlobalWarp;
 pub use invertible::InvertibleWarp;
 pub use known::{KnownWarp, TRUTH as KNOWN_TRUTH};
@@ -212,11 +212,23 @@ fn neutral(dof: Dof) -> Tensor {
     }
 }
 
+/// The parameter that holds the codes of all frames.
+pub(crate) const CODE: &str = "warp.code";
+
 /// The codes of a warp's frames, if it has any.
 pub fn codes(warp: &dyn Warp, frame: &Axis) -> Option<Parameter> {
     let width = warp.code_width();
     (width > 0).then(|| {
         let shape = Shape::new(&[frame], width);
-        Parameter::new("warp.code", shape, warp.code_init()).trained(warp.code_trained())
+        Parameter::new(CODE, shape, warp.code_init()).trained(warp.code_trained())
     })
+}
+
+/// The codes as a map sees them. A warp without codes that looks at them all the same carries an error.
+pub fn code_tensor(code: Option<&Parameter>) -> Tensor {
+    let none = || {
+        let hint = "let `Warp::code_width` say how many channels of a code the warp needs";
+        Tensor::misfit("Warp::map", &[], "the warp uses the code of a frame, but its `code_width` is 0", hint)
+    };
+    code.map_or_else(none, |c| c.tensor.clone())
 }

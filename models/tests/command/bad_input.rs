@@ -28,6 +28,8 @@ fn presets_and_keys_that_do_not_exist() {
     mentions(&w.refuse(&["train", "planar-l2g-smal"]), &["planar-l2g-smal", "did you mean `planar-l2g-small`?"]);
     mentions(&w.refuse(&["explain", "planr-barf"]), &["did you mean `planar-barf`?"]);
     mentions(&w.refuse(&["train", "missing.toml"]), &["missing.toml"]);
+    mentions(&w.refuse(&["train", "tiny.toml", "--data", "x"]), &["--data", "in the plane", "`--image`"]);
+    mentions(&w.refuse(&["train", "space.toml", "--image", "x"]), &["--image", "in space", "`--data`"]);
     mentions(
         &w.refuse(&["train", "tiny.toml", "--set", "optim.lr_wrap=1"]),
         &["optim.lr_wrap", "did you mean `optim.lr_warp`?"],

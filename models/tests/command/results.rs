@@ -223,3 +223,65 @@ fn explain_prints_the_plan_and_writes_artefacts() {
     assert_eq!(w.run(&["explain", "tiny.toml", "--device", "cpu", "--target", "gpu"]).status.code(), Some(2));
     mentions(&w.refuse(&["explain", "tiny.toml", "--device", "cpu", "--emit", "wgsl"]), &["CPU", "--device"]);
 }
+
+/// A run goes on where nobody hears of it, and ends as one that somebody watched.
+#[cfg(target_os = "linux")]
+#[test]
+fn progress_that_cannot_be_written_stops_nothing() {
+    let w = Workplace::new();
+    let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let args = ["train", "tiny.toml", "--out", "run"];
+    let output = w.command(&args).stderr(Stdio::from(full)).output().unwrap();
+    assert_eq!(output.status.code(), Some(0));
+    assert!(w.json("run/metrics.json")["final"].is_object());
+}
+
+/// What a run learns from stays what it was, or it is not gone on with and not measured.
+#[test]
+fn data_that_changed_under_a_run_are_refused() {
+    let w = Workplace::new();
+    let picture = |level: u8| {
+        let shade = |x: u32, y: u32| image::Rgb([(7 * x) as u8, (9 * y) as u8, level]);
+        image::RgbImage::from_fn(32, 24, shade).save(w.path("photo.png")).unwrap();
+    };
+    picture(10);
+    w.succeed(&["train", "tiny.toml", "--out", "drawn"]);
+    std::fs::copy(w.path("drawn/perturbation.json"), w.path("moved.json")).unwrap();
+    let begun = ["train", "tiny.toml", "--image", "photo.png", "--perturbation", "moved.json", "--out", "run"];
+    w.succeed(&begun);
+    let resumed = [&begun[..], &["--resume"]].concat();
+    w.succeed(&resumed);
+    picture(11);
+    mentions(&w.refuse(&resumed), &["run/perturbation.json", "other pictures than photo.png gives now"]);
+    mentions(&w.refuse(&["eval", "run"]), &["other pictures than photo.png"]);
+    picture(10);
+    let mut moved = w.json("moved.json");
+    let number = moved["perturbation"]["rotation"][1][0].as_f64().unwrap();
+    moved["perturbation"]["rotation"][1][0] = Value::from(number + 1e-3);
+    std::fs::write(w.path("moved.json"), moved.to_string()).unwrap();
+    mentions(&w.refuse(&resumed), &["other perturbations than moved.json gives now"]);
+    // The run has a copy of what it began with.
+    w.succeed(&["eval", "run"]);
+}
+
+/// A run that keeps averages ends with them, whether it was stopped or not, and is measured by them afterwards.
+#[test]
+fn runs_end_with_averages() {
+    for (file, w) in [("tiny.toml", Workplace::new()), ("space.toml", Workplace::in_space())] {
+        let train = |out: &str, average: &str, more: &[&str]| {
+            w.succeed(&[&["train", file, "--set", average, "--out", out], more].concat());
+            w.json(&format!("{out}/evaluation.json"))
+        };
+        let plain = train("plain", "optim.average=0", &[]);
+        let averaged = train("averaged", "optim.average=4", &[]);
+        assert_ne!(plain, averaged, "{file}");
+        assert_eq!(w.json("plain/metrics.json")["steps"], w.json("averaged/metrics.json")["steps"]);
+        w.succeed(&["eval", "averaged"]);
+        assert_eq!(w.json("averaged/evaluation.json"), averaged, "{file}");
+        assert_eq!(train("averaged", "optim.average=4", &["--resume"]), averaged, "{file}");
+        // One that follows at once is the value itself; its poses are fitted on a grid.
+        let last = train("last", "optim.average=1", &[]);
+        let grid = ["--set", "train.fit_grid=24"];
+        assert_eq!(last, if file == "tiny.toml" { plain } else { train("fitted", "optim.average=0", &grid) });
+    }
+}

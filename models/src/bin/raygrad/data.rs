@@ -39,7 +39,7 @@ pub fn run(args: &DataArgs) -> anyhow::Result<ExitCode> {
     // Sizes may differ where they are brought to one later; the summary shows the first.
     let loaded = loaded.or_else(|error| match error {
         SceneError::MixedSizes { expected, .. } => {
-            eprintln!("warning: {error}");
+            note!("warning: {error}");
             load(&args.folder, &LoadOptions { size: Some(expected), ..options }, &|_, _| ())
         }
         other => Err(other),
@@ -47,7 +47,7 @@ pub fn run(args: &DataArgs) -> anyhow::Result<ExitCode> {
     let scene = loaded.map_err(Error::from)?;
     print(&summary(&scene))?;
     if starts_blind(&scene) {
-        eprintln!(
+        note!(
             "warning: the cameras stand around something; training that starts captures from the identity finds cameras \
              that look the same way only: give it rough poses (scene.poses)"
         );

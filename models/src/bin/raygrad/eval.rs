@@ -114,10 +114,10 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
     }
     let lacks = |m: &Option<Measured>| m.as_ref().is_some_and(|m| m.mean.psnr_db.is_some() && m.mean.lpips.is_none());
     if had(Metric::Lpips) && lacks(&evaluation.before) {
-        eprintln!("note: evaluation.json had LPIPS, which is measured with `--lpips` only");
+        note!("note: evaluation.json had LPIPS, which is measured with `--lpips` only");
     }
     if had(Metric::Chamfer) && evaluation.cameras.mean.chamfer.is_none() {
-        eprintln!("note: evaluation.json had a Chamfer distance, which is measured with `--cloud` only");
+        note!("note: evaluation.json had a Chamfer distance, which is measured with `--cloud` only");
     }
     let mut text = table.to_text();
     if settings.scene.is_none() {

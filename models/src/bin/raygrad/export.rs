@@ -62,7 +62,7 @@ pub fn run(args: &ExportArgs) -> anyhow::Result<ExitCode> {
         match format.write(&cameras, &args.out) {
             Ok(name) => print(&format!("{} cameras in {}\n", cameras.len(), args.out.join(name).display()))?,
             // Nobody asked for this one.
-            Err(Error::Export(error)) if all => eprintln!("note: left out: {error}"),
+            Err(Error::Export(error)) if all => note!("note: left out: {error}"),
             Err(error) => return Err(error.into()),
         }
     }

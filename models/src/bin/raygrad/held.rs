@@ -29,15 +29,10 @@ impl HeldRun {
     /// The experiment, from the settings in the folder.
     pub fn experiment(&self) -> Result<Experiment, Error> {
         let mut experiment = Experiment::of_run(&self.run)?;
-        let in_space = experiment.layered.settings.scene.is_some();
-        let (plane, space) = ("the run is in the plane", "the run is in space");
-        let misplaced = [
-            ("--data", &self.data, !in_space, format!("{plane}; `--image` names its photo")),
-            ("--fit-grid", &self.fit_grid, !in_space, format!("{plane}, where fits are measured on all pixels")),
-            ("--image", &self.image, in_space, format!("{space}; `--data` names its scene")),
-        ];
-        if let Some((option, .., text)) = misplaced.into_iter().find(|(_, value, wrong, _)| *wrong && value.is_some()) {
-            return Err(experiment.layered.refuse(option, text).into());
+        crate::place(&experiment, "the run", self.image.is_some(), self.data.is_some())?;
+        if self.fit_grid.is_some() && experiment.layered.settings.scene.is_none() {
+            let text = "the run is in the plane, where fits are measured on all pixels";
+            return Err(experiment.layered.refuse("--fit-grid", text).into());
         }
         let options = [
             ("--data", "scene.path", &self.data),

@@ -3,6 +3,14 @@
 //! Exit codes: 0 done, 1 the computation failed, 2 something given was wrong (or could not be written), 130 interrupted
 //! with a checkpoint.
 
+/// Tells people something on standard error; a run goes on where nobody can hear it.
+macro_rules! note {
+    ($($text:tt)*) => {{
+        use std::io::Write as _;
+        let _ = writeln!(std::io::stderr(), $($text)*);
+    }};
+}
+
 mod bench;
 mod data;
 mod eval;
@@ -93,6 +101,17 @@ struct Choice {
     autotune: bool,
 }
 
+/// Refuses the photo of an experiment in space and the scene of one in the plane; `what` it is, for the message.
+fn place(experiment: &Experiment, what: &str, image: bool, data: bool) -> Result<(), Error> {
+    let in_space = experiment.layered.settings.scene.is_some();
+    let (option, text) = match (image && in_space, data && !in_space) {
+        (true, _) => ("--image", format!("{what} is in space; `--data` names its scene")),
+        (_, true) => ("--data", format!("{what} is in the plane; `--image` names its photo")),
+        _ => return Ok(()),
+    };
+    Err(experiment.layered.refuse(option, text).into())
+}
+
 impl Choice {
     /// The experiment with all overrides; options of their own win over `--set`.
     fn experiment(&self) -> Result<Experiment, Error> {
@@ -100,6 +119,7 @@ impl Choice {
         for assignment in &self.set {
             experiment = experiment.set(assignment)?;
         }
+        place(&experiment, "the preset", self.image.is_some(), self.data.is_some())?;
         let options = [
             ("--image", "data.image", &self.image),
             ("--data", "scene.path", &self.data),
@@ -147,8 +167,8 @@ fn main() -> ExitCode {
             let bad_input = error.downcast_ref::<Error>().map(Error::is_bad_input);
             match bad_input {
                 // These name their causes themselves.
-                Some(_) => eprintln!("error: {error}"),
-                None => eprintln!("error: {error:#}"),
+                Some(_) => note!("error: {error}"),
+                None => note!("error: {error:#}"),
             }
             ExitCode::from(if bad_input == Some(true) { 2 } else { 1 })
         }

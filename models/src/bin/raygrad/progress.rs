@@ -30,7 +30,7 @@ impl Progress {
     fn say(&self, text: &str) {
         match &self.bar {
             Some(bar) => bar.println(text),
-            None => eprintln!("{text}"),
+            None => note!("{text}"),
         }
     }
 
@@ -82,7 +82,7 @@ impl Observer for Progress {
                 bar.reset_eta();
                 bar.println(format!("training into {}", folder.display()));
             }
-            None => eprintln!("training into {}, step {done} of {steps}", folder.display()),
+            None => note!("training into {}, step {done} of {steps}", folder.display()),
         }
     }
 
@@ -104,7 +104,7 @@ impl Observer for Progress {
                     let rate = self.rate();
                     let left = duration((self.steps - entry.step) as f64 / rate.max(1e-9));
                     let state = Progress::state(entry);
-                    eprintln!("step {}/{}  {rate:.1} steps/s  ETA {left}  {state}", entry.step, self.steps);
+                    note!("step {}/{}  {rate:.1} steps/s  ETA {left}  {state}", entry.step, self.steps);
                 }
             }
         }
@@ -113,7 +113,7 @@ impl Observer for Progress {
     fn finishing(&mut self) {
         match &self.bar {
             Some(bar) => bar.finish(),
-            None => eprintln!("training done, writing pictures and report"),
+            None => note!("training done, writing pictures and report"),
         }
     }
 }

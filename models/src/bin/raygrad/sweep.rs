@@ -37,6 +37,9 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<ExitCode> {
     if let Some(weights) = &args.lpips {
         Lpips::load(weights).map_err(Error::from)?;
     }
+    if folder.is_dir() && RunFolder::held_settings(&folder).map_err(Error::from)?.is_some() {
+        bail!("{} is the folder of a run, not of a sweep; give another one with `--out`", folder.display());
+    }
     let mut open = true;
     for cell in &sweep.cells {
         open &= cell.progress(&folder)? == Progress::Open;
@@ -47,7 +50,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<ExitCode> {
     let stop = listen()?;
     let (mut done, mut failed) = (vec![], vec![]);
     for (i, cell) in sweep.cells.iter().enumerate() {
-        eprintln!("run {} of {}: {}", i + 1, sweep.cells.len(), cell.name);
+        note!("run {} of {}: {}", i + 1, sweep.cells.len(), cell.name);
         match train(cell, &folder, args.lpips.as_deref(), &stop) {
             Ok(Some(evaluation)) => done.push((cell, evaluation)),
             Ok(None) | Err(Error::Stopped) => {
@@ -56,7 +59,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<ExitCode> {
             }
             // One run that fails, by diverging, for a damaged scene or as another process trains it, leaves the others.
             Err(error) => {
-                eprintln!("{} failed: {error}", cell.name);
+                note!("{} failed: {error}", cell.name);
                 failed.push(cell.name.as_str());
             }
         }
@@ -87,7 +90,7 @@ fn train(
             return match lpips.filter(|_| lacks) {
                 Some(weights) => match measured_again(&cell.folder(folder), weights, stop) {
                     Err(error) if !matches!(error, Error::Stopped) => {
-                        eprintln!("{} stays without LPIPS: {error}", cell.name);
+                        note!("{} stays without LPIPS: {error}", cell.name);
                         Ok(Some(*evaluation))
                     }
                     other => other.map(Some),

@@ -42,7 +42,7 @@ pub fn run(args: &TrainArgs) -> anyhow::Result<ExitCode> {
     let layered = &experiment.layered;
     let own: Vec<String> = layered.of_scene().iter().map(|(key, value)| format!("{key} = {value}")).collect();
     if !own.is_empty() {
-        eprintln!("{} sets for {}: {}", layered.name, layered.settings.scene_name(), own.join(", "));
+        note!("{} sets for {}: {}", layered.name, layered.settings.scene_name(), own.join(", "));
     }
     let stop = listen()?;
     let outcome = experiment.train_observed(&mut Progress::new(), &stop)?;

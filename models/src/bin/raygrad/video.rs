@@ -36,7 +36,7 @@ pub fn run(args: &VideoArgs) -> anyhow::Result<ExitCode> {
         let path = match write_video(frames, RATE, &folder.join(name)).map_err(Error::from)? {
             Video::Mp4(path) | Video::AnimatedPng(path, None) => path,
             Video::AnimatedPng(path, Some(failure)) => {
-                eprintln!("note: an animated picture instead of a video: {failure}");
+                note!("note: an animated picture instead of a video: {failure}");
                 path
             }
         };
