@@ -96,7 +96,7 @@ fn systems_that_are_not_positive() {
     let g = Tensor::parameter("g", Shape::new(&[], (3, 3)));
     bound.fill(&g, &[0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -4.0]);
     let h = solve_symmetric(&g, &Tensor::constant(&[3.0, 5.0, 2.0]));
-    assert!(worst(&bound.run(&[h.clone()])[0], &[5.0, 3.0, -0.5], 1.0) < 1e-9);
+    assert!(worst(&bound.run(std::slice::from_ref(&h))[0], &[5.0, 3.0, -0.5], 1.0) < 1e-9);
     let loss = total(&(&h * Tensor::constant(&[0.3, -1.0, 0.5])));
     check_gradient(&loss, &[g], &bound.bindings, 1e-7, "solve_symmetric");
 }

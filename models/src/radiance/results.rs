@@ -10,7 +10,7 @@ use crate::geometry::Pose;
 use crate::pictures::{self, Canvas};
 use crate::report::{Picture, Report};
 use crate::run::RunFolder;
-use crate::run::metrics::{Final, Measured, Metrics};
+use crate::run::metrics::{Final, Metrics};
 use crate::run::results::{FRAMES, animation};
 use crate::scene::{Layout, View, stand_around};
 use crate::training::{Training, Watch};
@@ -131,7 +131,9 @@ pub fn write_report(
 pub fn summary(views: usize, last: &Final, evaluation: Option<&Evaluation>) -> String {
     let (steps, time) = (last.entry.step, crate::report::duration(last.seconds));
     let mut text = String::new();
-    if let Measured::Space { rotation_error_deg: Some(r), translation_error_x100: Some(t), .. } = last.entry.measured {
+    // What was evaluated: a run that ends with averages, or fits its poses once more, ends elsewhere than its last step.
+    let mean = |metric| evaluation.and_then(|e| e.cameras.mean.get(metric));
+    if let (Some(r), Some(t)) = (mean(Metric::RotationErrorDeg), mean(Metric::TranslationErrorX100)) {
         text += &format!("rotation error     {r:.3} deg (mean over {views} training views)\n");
         text += &format!("translation error  {t:.3} x 0.01\n");
     }

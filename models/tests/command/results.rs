@@ -269,8 +269,13 @@ fn data_that_changed_under_a_run_are_refused() {
 fn runs_end_with_averages() {
     for (file, w) in [("tiny.toml", Workplace::new()), ("space.toml", Workplace::in_space())] {
         let train = |out: &str, average: &str, more: &[&str]| {
-            w.succeed(&[&["train", file, "--set", average, "--out", out], more].concat());
-            w.json(&format!("{out}/evaluation.json"))
+            let printed = w.succeed(&[&["train", file, "--set", average, "--out", out], more].concat());
+            let evaluation = w.json(&format!("{out}/evaluation.json"));
+            // What is printed is what was evaluated, and not the last step.
+            if let Some(r) = evaluation["cameras"]["mean"]["rotation_error_deg"].as_f64() {
+                mentions(&printed, &[&format!("rotation error     {r:.3} deg")]);
+            }
+            evaluation
         };
         let plain = train("plain", "optim.average=0", &[]);
         let averaged = train("averaged", "optim.average=4", &[]);
