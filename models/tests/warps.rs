@@ -175,6 +175,19 @@ fn tiny(warp: impl Warp + 'static) -> Experiment {
     small.unwrap_or_else(|e| panic!("{e}")).warp(warp)
 }
 
+/// Patches of 64 pixels have no more points than that.
+#[test]
+fn more_points_than_pixels_are_all_pixels() {
+    let program = |points: usize| {
+        let by = Parameter::new("shift", Shape::new(&[], 2), Init::Zero);
+        let experiment = tiny(Shifted { by, listed: true }).set(&format!("data.points_per_patch={points}"));
+        let trainer = experiment.and_then(|e| e.trainer()).unwrap_or_else(|e| panic!("{e}"));
+        trainer.learner().program(trainer.training_program()).to_string()
+    };
+    assert_eq!(program(100_000), program(64));
+    assert_ne!(program(63), program(64));
+}
+
 #[test]
 fn codes_and_inputs_that_nobody_gives_are_refused() {
     let radial = |at: &Points, code: &Tensor| &at.xy * (1.0 + code.ch(0) * (at.x() * at.x() + at.y() * at.y()));
@@ -185,9 +198,8 @@ fn codes_and_inputs_that_nobody_gives_are_refused() {
     ] {
         assert!(text.contains("its `code_width` is 0"), "{text}");
     }
-    let heated = |at: &Points, code: &Tensor| {
-        &at.xy + code * Tensor::input("my.temperature", Role::PerStep, Shape::new(&[], 1))
-    };
+    let heated =
+        |at: &Points, code: &Tensor| &at.xy + code * Tensor::input("my.temperature", Role::PerStep, Shape::new(&[], 1));
     let warp = Promising { map: heated, code: 2, global: None, dof: Dof::Homography, identity: false };
     let mut training = tiny(warp).training().unwrap_or_else(|e| panic!("{e}"));
     let text = training.step().expect_err("refused").to_string();

@@ -22,7 +22,10 @@ pub fn vjp(output: &Tensor, upstream: &Tensor, wanted: &[&Tensor]) -> Vec<Tensor
     }
     if let Some(bad) = [output].into_iter().chain(wanted.iter().copied()).find(|t| t.dtype() == DType::U32) {
         let problem = "whole numbers have no derivative";
-        return vec![Tensor::misfit("grad", &[bad], problem, "differentiate before rounding to u32, or by a float"); wanted.len()];
+        return vec![
+            Tensor::misfit("grad", &[bad], problem, "differentiate before rounding to u32, or by a float");
+            wanted.len()
+        ];
     }
     let order = topological([output.clone()]);
     // Inputs of one name are one input, however often they were recorded.
@@ -82,7 +85,12 @@ pub fn jvp(output: &Tensor, inputs: &[&Tensor], tangents: &[&Tensor]) -> Tensor 
         let fits = tangent.axes().is_subset(input.axes()) && [1, input.width()].contains(&tangent.width());
         if !fits && input.error().is_none() && tangent.error().is_none() {
             let problem = "a tangent (operand 2) does not fit its input (operand 1)";
-            return Tensor::misfit("jvp", &[input, tangent], problem, "give one direction, of the input's axes and channels");
+            return Tensor::misfit(
+                "jvp",
+                &[input, tangent],
+                problem,
+                "give one direction, of the input's axes and channels",
+            );
         }
     }
     // It is linear in this one, which no program ever sees; derivatives of derivatives have one each.

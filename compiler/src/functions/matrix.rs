@@ -138,6 +138,9 @@ pub fn apply_homography(h: &Tensor, x: &Tensor) -> Tensor {
 /// Eigenvalues below this part of the largest one are raised to it before dividing by them. A matrix in single precision says
 /// nothing of smaller ones, and dividing by what rounding left of them loses the digits of everything else.
 const SINGULAR: f64 = 1e-9;
+/// Eigenvalues are negative only if they are larger than this part of the largest one: rounding makes smaller ones of matrices that
+/// have none.
+const NEGATIVE: f64 = 1e-5;
 
 /// `G^-1 b` for a symmetric `G`, `(n, n)` with n <= 9, and n channels, by the eigen-decomposition of (the symmetric part of) G.
 ///
@@ -151,9 +154,9 @@ pub fn solve_symmetric(g: &Tensor, b: &Tensor) -> Tensor {
         return Tensor::misfit("solve_symmetric", &[g, b], problem, hint);
     }
     let (values, vectors) = g.stop_gradient().sym_eig();
-    let least = values.abs().max_channels() * SINGULAR;
-    // What rounding has made of a small positive one is no negative one.
-    let divisors = values.less_than(&-&least).select(&values, &values.max(&least));
+    let largest = values.abs().max_channels();
+    let least = &largest * SINGULAR;
+    let divisors = values.less_than(&(largest * -NEGATIVE)).select(&values, &values.max(&least));
     let along = apply(&vectors.transpose(), b) / divisors;
     let solution = apply(&vectors, &along);
     custom_adjoint(&solution, &[g, b], |inputs, grad| {

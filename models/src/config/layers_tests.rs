@@ -122,7 +122,7 @@ fn captures_have_values_of_their_own_until_others_are_set() {
     let scene = |l: &mut Layered, path: &str| l.set(&format!("scene.path={path}")).unwrap();
     assert_eq!((numbers(&l), own(&l)), ((9, 0.5), 0));
     scene(&mut l, &path("photos"));
-    assert_eq!((numbers(&l), own(&l)), ((7, 0.25), 6));
+    assert_eq!((numbers(&l), own(&l)), ((7, 0.25), 7));
     assert_eq!(l.origin("optim.lr"), Origin::Line { file: file.clone(), line: 4 });
     scene(&mut l, "builtin");
     assert_eq!(numbers(&l), (9, 0.5));

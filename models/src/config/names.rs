@@ -1,6 +1,8 @@
 //! What papers call a run: its method, its scene, and where its poses started.
 
-use super::{CodeKind, Dof, Encoding, FieldKind, ImageSize, Layered, Method, NoiseKind, Origin, SceneSettings, Settings};
+use super::{
+    CodeKind, Dof, Encoding, FieldKind, ImageSize, Layered, Method, NoiseKind, Origin, SceneSettings, Settings,
+};
 use crate::scene::Layout;
 use std::path::Path;
 

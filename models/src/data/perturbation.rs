@@ -130,7 +130,8 @@ impl Perturbation {
                 return mismatch("a number of patches of", len.to_string(), settings.data.patches.to_string(), hint);
             }
         }
-        let all = p.homography.iter().flatten().chain(p.rotation.iter().flatten()).chain(p.translation.iter().flatten());
+        let all =
+            p.homography.iter().flatten().chain(p.rotation.iter().flatten()).chain(p.translation.iter().flatten());
         if let Some(x) = all.into_iter().find(|x| x.is_nan() || x.abs() > LARGEST) {
             return Err(format(format!("expected numbers of at most {LARGEST}, found {x:e}")));
         }

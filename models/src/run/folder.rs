@@ -14,6 +14,8 @@ pub const CONFIG: &str = "config.toml";
 pub enum FolderError {
     #[error(transparent)]
     Write(#[from] WriteError),
+    #[error("{} is the folder of a run, not of a sweep; give another one with `--out`", .path.display())]
+    OfRun { path: PathBuf },
     #[error("{} is not a folder", .path.display())]
     NotAFolder { path: PathBuf },
     #[error("cannot use the folder {}: {source}", .path.display())]

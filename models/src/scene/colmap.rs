@@ -364,11 +364,17 @@ mod tests {
     /// The file `cameras.bin` of one camera of this model, of 8 x 6 pixels.
     fn camera(model: u32) -> Vec<u8> {
         let numbers = [50.0_f64, 4.0, 3.0, 0.0, 0.0, 0.0, 0.0, 0.0].map(f64::to_le_bytes).concat();
-        [&1_u64.to_le_bytes()[..], &7_u32.to_le_bytes(), &model.to_le_bytes(), &8_u64.to_le_bytes(), &6_u64.to_le_bytes()]
-            .concat()
-            .into_iter()
-            .chain(numbers)
-            .collect()
+        [
+            &1_u64.to_le_bytes()[..],
+            &7_u32.to_le_bytes(),
+            &model.to_le_bytes(),
+            &8_u64.to_le_bytes(),
+            &6_u64.to_le_bytes(),
+        ]
+        .concat()
+        .into_iter()
+        .chain(numbers)
+        .collect()
     }
 
     #[test]

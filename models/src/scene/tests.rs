@@ -73,13 +73,11 @@ fn dtu_cameras_in(root: &Path, focal_x: [f64; 2], skew: f64, [radius, away]: [f6
     for i in 0..12 {
         let x = f64::from(i);
         let world = [f, skew, cx, -f * x, 0.0, f, 12.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
-        let scale: [f64; 16] = std::array::from_fn(|k| {
-            match k {
-                15 => 1.0,
-                11 => away,
-                _ if k % 5 == 0 => radius,
-                _ => 0.0,
-            }
+        let scale: [f64; 16] = std::array::from_fn(|k| match k {
+            15 => 1.0,
+            11 => away,
+            _ if k % 5 == 0 => radius,
+            _ => 0.0,
         });
         for (name, values) in [("world", world), ("scale", scale)] {
             archive.start_file(format!("{name}_mat_{i}.npy"), stored).unwrap();

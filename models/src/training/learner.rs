@@ -73,7 +73,8 @@ impl Learner {
         let (session, optim) = (Session::new(device.clone())?, settings.optim.clone());
         let (networks, autotune) = (settings.run.networks, settings.run.autotune);
         let (inputs, given) = (BTreeMap::new(), BTreeSet::new());
-        let mut learner = Learner { session, device, networks, autotune, optim, inputs, given, step: 0, stepped: false };
+        let mut learner =
+            Learner { session, device, networks, autotune, optim, inputs, given, step: 0, stepped: false };
         let program = learner.add(step)?;
         Ok((learner, program))
     }

@@ -160,4 +160,8 @@ fn bad_sweeps_are_refused_before_anything_runs() {
     std::fs::write(w.path("thesis/builtin-tiny-s0/chapter.tex"), "text").unwrap();
     mentions(&w.refuse(&["sweep", "grid.toml", "--out", "thesis"]), &["not empty and holds no raygrad run"]);
     assert!(!w.path("out").exists() && !w.path("runs").exists());
+    w.succeed(&["train", "tiny.toml", "--out", "run"]);
+    let files = names(&w.path("run"));
+    mentions(&w.refuse(&["sweep", "grid.toml", "--out", "run"]), &["run is the folder of a run"]);
+    assert_eq!(names(&w.path("run")), files);
 }

@@ -38,7 +38,7 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<ExitCode> {
         Lpips::load(weights).map_err(Error::from)?;
     }
     if folder.is_dir() && RunFolder::held_settings(&folder).map_err(Error::from)?.is_some() {
-        bail!("{} is the folder of a run, not of a sweep; give another one with `--out`", folder.display());
+        return Err(Error::from(FolderError::OfRun { path: folder }).into());
     }
     let mut open = true;
     for cell in &sweep.cells {
