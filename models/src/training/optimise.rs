@@ -48,8 +48,8 @@ impl Rates {
             lr_warp: decayed(optim.lr_warp, optim.lr_warp_end) * warm,
             bias1,
             bias2,
-            // A mean of all steps so far, until they are as many as it is to remember.
-            average: 1.0 / (it + 1).min(optim.average.max(1)) as f64,
+            // A mean of all steps so far, until they are as many as it is to remember; of a short run, not of its beginning.
+            average: 1.0 / (it + 1).min(optim.average.min(optim.steps / 3).max(1)) as f64,
         }
     }
 
