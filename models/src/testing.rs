@@ -203,7 +203,8 @@ impl Bench {
     }
 }
 
-/// Checks that a warp does what its `global` and `zero_code_is_identity` say, its derivatives, first and second order, and its values and gradients on every device there is.
+/// Checks that a warp does what its `global` and `zero_code_is_identity` say, its derivatives, first and second order, and its
+/// values and gradients on every device there is.
 pub fn check_gradients(warp: &dyn Warp) -> Result<(), TestError> {
     check_gradients_on(warp, &devices()?)
 }

@@ -135,16 +135,19 @@ impl Session {
 
     /// The current value of a float input, in host order; waits for the device.
     pub fn get(&mut self, name: &str) -> Result<Vec<f32>, RunError> {
-        let info = self.inputs.get(name).ok_or_else(|| RunError::UnknownInput(name.into()))?;
-        of_floats(name, &info.shape)?;
-        Ok(bytemuck::allocation::cast_vec(self.get_lanes(name)?))
+        let (shape, lanes) = self.input(name)?;
+        floats(name, shape, lanes)
     }
 
     /// The current lanes of any input, in host order; waits for the device.
     pub fn get_lanes(&mut self, name: &str) -> Result<Vec<u32>, RunError> {
+        Ok(self.input(name)?.1)
+    }
+
+    fn input(&mut self, name: &str) -> Result<(&Shape, Vec<u32>), RunError> {
         let info = self.inputs.get(name).ok_or_else(|| RunError::UnknownInput(name.into()))?;
         let lanes = self.executor.get(name)?;
-        Ok(to_host(lanes, &info.shape))
+        Ok((&info.shape, to_host(lanes, &info.shape)))
     }
 
     /// Runs a program once. On a GPU this only submits.
@@ -162,24 +165,23 @@ impl Session {
 
     /// A float output of the program's last run, in host order; waits for the device.
     pub fn read(&mut self, program: ProgramId, output: &str) -> Result<Vec<f32>, RunError> {
-        let (_, _, shape) = self.output(program, output)?;
-        of_floats(output, &shape)?;
-        Ok(bytemuck::allocation::cast_vec(self.read_lanes(program, output)?))
+        let (shape, lanes) = self.output(program, output)?;
+        floats(output, shape, lanes)
     }
 
     /// The lanes of any output, in host order; waits for the device.
     pub fn read_lanes(&mut self, program: ProgramId, output: &str) -> Result<Vec<u32>, RunError> {
-        let (number, buffer, shape) = self.output(program, output)?;
-        let lanes = self.executor.output(number, buffer)?;
-        Ok(to_host(lanes, &shape))
+        Ok(self.output(program, output)?.1)
     }
 
-    fn output(&self, program: ProgramId, output: &str) -> Result<(usize, BufferId, Shape), RunError> {
+    fn output(&mut self, program: ProgramId, output: &str) -> Result<(&Shape, Vec<u32>), RunError> {
         let number = self.own(program)?;
         let plan = &self.programs[number];
         let found = plan.outputs.iter().find(|(name, _)| name == output);
         let (_, buffer) = found.ok_or_else(|| RunError::UnknownOutput(output.into()))?;
-        Ok((number, *buffer, plan.buffer(*buffer).shape.clone()))
+        let shape = &plan.buffer(*buffer).shape;
+        let lanes = self.executor.output(number, *buffer)?;
+        Ok((shape, to_host(lanes, shape)))
     }
 
     /// A loaded program.
@@ -196,9 +198,12 @@ impl Session {
     }
 }
 
-/// Lanes of whole numbers are no floats.
-fn of_floats(name: &str, shape: &Shape) -> Result<(), RunError> {
-    if shape.dtype == DType::F32 { Ok(()) } else { Err(RunError::Lanes { name: name.into(), shape: shape.clone() }) }
+/// Lanes of floats; those of whole numbers are none.
+fn floats(name: &str, shape: &Shape, lanes: Vec<u32>) -> Result<Vec<f32>, RunError> {
+    match shape.dtype {
+        DType::F32 => Ok(bytemuck::allocation::cast_vec(lanes)),
+        DType::U32 => Err(RunError::Lanes { name: name.into(), shape: shape.clone() }),
+    }
 }
 
 /// Programs may be recorded with axes of their own: names and sizes must agree.

@@ -4,12 +4,13 @@ use raygrad_compiler::Step;
 use raygrad_compiler::functions::along::{concat_along, slice_along};
 use raygrad_compiler::functions::inverse::{determinant, inverse, solve};
 use raygrad_compiler::functions::loss::{charbonnier, mean_absolute_error, mean_squared_error};
-use raygrad_compiler::functions::matrix::{apply, identity, matmul};
+use raygrad_compiler::functions::matrix::{apply, identity, matmul, solve_symmetric};
 use raygrad_compiler::functions::vector::{dot, norm, normalize};
 use raygrad_compiler::graph::{Axis, Shape, Tensor};
 use raygrad_compiler::reference::{Array, Bindings};
 use raygrad_tests::backend::{devices, reference, round, run};
-use raygrad_tests::{Rng, derivatives, worst};
+use raygrad_tests::vectors::Bound;
+use raygrad_tests::{Rng, check_gradient, derivatives, total, worst};
 
 /// Outputs in the reference; every device agrees with it to `tolerance` of an output's largest value.
 fn everywhere(outputs: &[Tensor], bindings: &Bindings, tolerance: f64) -> Vec<Vec<f64>> {
@@ -130,4 +131,25 @@ fn whole_powers_take_any_base() {
     assert_eq!(found[4][..2], [1.0 / 9.0, 1.0 / 25.0]);
     assert_eq!(found[5], [1.0; 4]);
     assert!((found[6][3] - 27f64.sqrt()).abs() < 1e-12 && found[6][1] == 0.0);
+}
+
+#[test]
+fn the_gradient_of_a_solution_does_not_mind_equal_eigenvalues() {
+    let mut bound = Bound::default();
+    let g = Tensor::parameter("g", Shape::new(&[], (3, 3)));
+    bound.fill(&g, &[2.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 2.0]);
+    let h = solve_symmetric(&g, &Tensor::constant(&[1.0, 2.0, -1.0]));
+    let loss = total(&(&h * Tensor::constant(&[0.3, -1.0, 0.5])));
+    check_gradient(&loss, &[g], &bound.bindings, 1e-8, "solve_symmetric");
+}
+
+#[test]
+fn systems_that_are_not_positive() {
+    let mut bound = Bound::default();
+    let g = Tensor::parameter("g", Shape::new(&[], (3, 3)));
+    bound.fill(&g, &[0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -4.0]);
+    let h = solve_symmetric(&g, &Tensor::constant(&[3.0, 5.0, 2.0]));
+    assert!(worst(&bound.run(std::slice::from_ref(&h))[0], &[5.0, 3.0, -0.5], 1.0) < 1e-9);
+    let loss = total(&(&h * Tensor::constant(&[0.3, -1.0, 0.5])));
+    check_gradient(&loss, &[g], &bound.bindings, 1e-7, "solve_symmetric");
 }

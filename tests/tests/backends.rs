@@ -122,3 +122,22 @@ fn inputs_are_set_part_by_part() {
         assert_eq!(session.read_lanes(id, "y").unwrap(), [10, 21, 3, 5, 7, 65, 10]);
     }
 }
+
+/// Bits of whole numbers are no floats.
+#[test]
+fn whole_numbers_are_read_as_such() {
+    let row = Axis::new("row", 3);
+    let n = Tensor::data("n", Shape::new(&[&row], 1).with_dtype(DType::U32));
+    let step = Step { outputs: vec![("y".into(), n.wrapping_add(&Tensor::integers(&[2])))], updates: vec![] };
+    for device in devices() {
+        let mut session = Session::new(device.clone()).unwrap();
+        let program = session.add(compile(&step, &device.target()).unwrap()).unwrap();
+        session.set_u32("n", &[1, 5, 7]).unwrap();
+        session.run(program).unwrap();
+        for error in [session.read(program, "y").unwrap_err(), session.get("n").unwrap_err()] {
+            assert!(error.to_string().contains("[row=3] x 1 u32: read its lanes"), "{error}");
+        }
+        assert_eq!(session.read_lanes(program, "y").unwrap(), [3, 7, 9]);
+        assert_eq!(session.get_lanes("n").unwrap(), [1, 5, 7]);
+    }
+}

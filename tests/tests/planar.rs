@@ -170,8 +170,9 @@ fn assert_close(what: &str, start: &Bindings, found: &Trajectory, expected: &Tra
 #[test]
 fn five_steps_of_training_against_the_reference() {
     let devices = devices_for_large_programs();
+    let averaged = [&SMALL[..], &["optim.average=2"]].concat();
     for preset in ["planar-l2g", "planar-l2g-rigid", "planar-barf", "planar-naive", "planar-none"] {
-        let mut planar = Planar::new(preset, &SMALL);
+        let mut planar = Planar::new(preset, &averaged);
         let expected = train_reference(&mut planar, 5);
         for device in &devices {
             let found = train(device, &mut planar, 5);

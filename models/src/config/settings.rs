@@ -242,7 +242,8 @@ pub struct Optim {
     pub lr_warp: f64,
     pub lr_warp_end: f64,
     pub warmup_pose: usize,
-    /// Steps, at most a third of all, that the averages of trained values remember, with which a run ends; 0: it ends with the values themselves.
+    /// Steps, at most a third of all, that the averages of trained values remember, with which a run ends; 0: it ends with the
+    /// values themselves.
     #[serde(default)]
     pub average: usize,
 }

@@ -55,8 +55,8 @@ pub struct Learner {
     autotune: bool,
     optim: Optim,
     inputs: BTreeMap<String, InputInfo>,
-    /// Inputs that were set.
-    given: BTreeSet<String>,
+    /// Inputs from the host that were never set.
+    unset: BTreeSet<String>,
     step: usize,
     /// Whether a training program's outputs are of the present state: a step was done since it began or was restored.
     stepped: bool,
@@ -72,9 +72,9 @@ impl Learner {
         };
         let (session, optim) = (Session::new(device.clone())?, settings.optim.clone());
         let (networks, autotune) = (settings.run.networks, settings.run.autotune);
-        let (inputs, given) = (BTreeMap::new(), BTreeSet::new());
+        let (inputs, unset) = (BTreeMap::new(), BTreeSet::new());
         let mut learner =
-            Learner { session, device, networks, autotune, optim, inputs, given, step: 0, stepped: false };
+            Learner { session, device, networks, autotune, optim, inputs, unset, step: 0, stepped: false };
         let program = learner.add(step)?;
         Ok((learner, program))
     }
@@ -82,6 +82,9 @@ impl Learner {
     /// Compiles one more program.
     pub fn add(&mut self, step: &Step) -> Result<ProgramId, Error> {
         let program = self.session.add(self.compile(step)?)?;
+        let from_host = |role| matches!(role, Role::Data | Role::PerStep);
+        let new = self.session.inputs().filter(|(name, info)| from_host(info.role) && !self.inputs.contains_key(*name));
+        self.unset.extend(new.map(|(name, _)| name.to_string()));
         self.inputs = self.session.inputs().map(|(name, info)| (name.to_string(), info.clone())).collect();
         Ok(program)
     }
@@ -110,7 +113,7 @@ impl Learner {
     pub fn set(&mut self, name: &str, values: &[f32]) -> Result<(), Error> {
         if self.has(name) {
             self.session.set(name, values)?;
-            self.given.insert(name.to_string());
+            self.unset.remove(name);
         }
         Ok(())
     }
@@ -119,7 +122,7 @@ impl Learner {
     pub fn set_u32(&mut self, name: &str, values: &[u32]) -> Result<(), Error> {
         if self.has(name) {
             self.session.set_u32(name, values)?;
-            self.given.insert(name.to_string());
+            self.unset.remove(name);
         }
         Ok(())
     }
@@ -127,7 +130,7 @@ impl Learner {
     /// Sets some elements of an input of whole numbers and one channel, from element `first` on.
     pub fn set_u32_from(&mut self, name: &str, first: usize, values: &[u32]) -> Result<(), Error> {
         self.session.set_u32_from(name, first, values)?;
-        self.given.insert(name.to_string());
+        self.unset.remove(name);
         Ok(())
     }
 
@@ -169,9 +172,8 @@ impl Learner {
     pub fn train(&mut self, program: ProgramId) -> Result<(), Error> {
         self.set_rates()?;
         if !self.stepped {
-            let from_host = |role| matches!(role, Role::Data | Role::PerStep);
             let mut all = self.session.program(program).inputs();
-            if let Some((name, ..)) = all.find(|(name, role, _)| from_host(*role) && !self.given.contains(*name)) {
+            if let Some((name, ..)) = all.find(|(name, ..)| self.unset.contains(*name)) {
                 return Err(Error::UnsetInput { name: name.to_string() });
             }
         }
