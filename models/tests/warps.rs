@@ -303,3 +303,52 @@ fn penalties_are_of_pixels_and_centers() {
         assert!((found - expected).abs() < 1e-9 && weight == 1.0, "{found} instead of {expected}");
     }
 }
+
+/// Moves rays by a pose, which is left to be fitted.
+#[derive(Debug)]
+struct Turned;
+
+impl Warp for Turned {
+    fn map(&self, at: &Points, code: &Tensor) -> Tensor {
+        GlobalWarp { dof: Dof::Pose }.map(at, code)
+    }
+    fn dof(&self) -> Dof {
+        Dof::Pose
+    }
+}
+
+/// A warp with an origin of its own turns cameras about that point, and its transforms take field points back, whether they
+/// are given or fitted.
+#[test]
+fn cameras_turn_about_the_origin_of_a_warp() {
+    let (frame, point) = (Axis::new("frame", 1), Axis::new("point", 4));
+    let origin = [0.5, -1.0, 2.0];
+    let (plane, center) = ([-0.4, -0.3, 1.0, 0.4, -0.3, 1.0, 0.4, 0.3, 1.0, -0.4, 0.2, 1.0], [0.1, 0.2, 0.0]);
+    let position = Tensor::data("pixels", Shape::new(&[&point], 3));
+    let of = |position: &Tensor, first| {
+        let xy = position.slice(0..2);
+        Points { frame: frame.clone(), point: point.clone(), xy, position: position.clone(), first }
+    };
+    let (pixels, centers) = (of(&position, 0), of(&Tensor::constant(&center), 4));
+    let bound: Bindings =
+        [("pixels".to_string(), Array::floats(position.shape(), plane.to_vec()))].into_iter().collect();
+    // Points turn by 0.3 about the y axis through the origin; a warp's code says where the camera goes, the other way round.
+    let turned = |p: &[f64]| {
+        let ([x, y, z], (sin, cos)) = ([0, 1, 2].map(|i| p[i] - origin[i]), 0.3f64.sin_cos());
+        [origin[0] + cos * x + sin * z, origin[1] + y, origin[2] - sin * x + cos * z]
+    };
+    for warp in [&GlobalWarp { dof: Dof::Pose } as &dyn Warp, &Turned] {
+        let code = Tensor::constant(&[0.0, -0.3, 0.0, 0.0, 0.0, 0.0]);
+        let found = Registration::about(origin, warp, &pixels, Some(&centers), &code, false);
+        let mapped = found.centers.unwrap();
+        let back = |p: &Tensor| apply_affine(&found.transform, p);
+        let all = [back(&found.local), back(&mapped), found.local, found.global, mapped];
+        let all = evaluate(&all, &bound).unwrap();
+        let expected: Vec<f64> = plane.chunks(3).flat_map(turned).collect();
+        let expected = [&plane[..], &center, &expected, &expected, &turned(&center)];
+        for (i, (found, expected)) in all.iter().zip(expected).enumerate() {
+            let near = found.f().iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-9);
+            assert!(near && found.f().len() == expected.len(), "{warp:?}, {i}: {:?}, {expected:?}", found.f());
+        }
+    }
+}

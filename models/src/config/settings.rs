@@ -182,6 +182,9 @@ pub struct WarpSettings {
     pub activation: ActivationKind,
     /// Of rotations, and of translations.
     pub output_scale: [f64; 2],
+    /// In 3D, the point of the world about which the warp turns cameras.
+    #[serde(default)]
+    pub origin: [f64; 3],
     pub solver: Solver,
     pub inn: InnSettings,
 }

@@ -215,6 +215,9 @@ impl Layered {
             let text = format!("expected two factors above 0, found {:?}", warp.output_scale);
             return Err(self.refuse("warp.output_scale", text));
         }
+        if !warp.origin.iter().all(|x| x.is_finite()) {
+            return Err(self.refuse("warp.origin", format!("expected a point, found {:?}", warp.origin)));
+        }
         if warp.bands > MAX_BANDS {
             return Err(self.refuse("warp.bands", format!("expected 0 to {MAX_BANDS} bands, found {}", warp.bands)));
         }

@@ -16,7 +16,7 @@ use super::error_map::ErrorMap;
 use super::lens::Lens;
 use super::rays::{Cameras, ImageSize, Rays, range_of};
 use super::rendering::{Purpose, Rendering, Seen};
-use crate::config::{DepthSettings, RadianceSettings, SceneSettings, Settings, TrainSettings};
+use crate::config::{DepthSettings, RadianceSettings, SceneSettings, Settings, TrainSettings, WarpSettings};
 use crate::scene::View;
 use crate::training::optimise::{STEP, hold_first, keep_averages, scales_loss, update_of, updates};
 use crate::warps::{self, Registration, Warp};
@@ -210,8 +210,8 @@ impl RadianceModel {
     fn registered(&self, ray: &Axis, index: &Tensor) -> Registration {
         let cameras = Cameras::new(&self.frame, ray, index, self.size, &self.intrinsics(), &self.rough_poses());
         let code = warps::code_tensor(self.code.as_ref());
-        let pinned = self.settings.warp.fix_first;
-        Registration::new(&*self.warp, &cameras.pixels, Some(&cameras.centers), &code, pinned)
+        let WarpSettings { origin, fix_first, .. } = self.settings.warp;
+        Registration::about(origin, &*self.warp, &cameras.pixels, Some(&cameras.centers), &code, fix_first)
     }
 
     /// The poses of the training views fitted once more, at the pixels [`FIT_PIXELS`], so many of them in every view: an update of

@@ -20,7 +20,7 @@ pub use local::LocalWarp;
 pub use plain::{ImplicitMlpWarp, MlpWarp, Se3Field};
 
 use crate::config::{Dof, Method, Settings, Solver};
-use raygrad_compiler::functions::matrix::identity;
+use raygrad_compiler::functions::matrix::{apply, identity, join_affine, split_pose};
 use raygrad_compiler::functions::mlp::{Init, Parameter};
 use raygrad_compiler::graph::with_source;
 use raygrad_compiler::{Axes, Axis, Shape, Tensor};
@@ -35,7 +35,7 @@ pub struct Points {
     /// Where on the sensor: two channels along `point`, and along `frame` if the frames have different points.
     pub xy: Tensor,
     /// What is mapped: `xy` itself; in 3D three channels, the pixel at unit depth or the camera's centre, where the frame's
-    /// rough guess of its pose puts them.
+    /// rough guess of its pose puts them, as seen from the warp's origin ([`Registration::about`]).
     pub position: Tensor,
     /// How many points of the same frame come before these: the camera centres follow the pixels.
     pub first: usize,
@@ -186,6 +186,32 @@ impl Registration {
             residual = (residual + fit::residual(warp.dof(), &transform, at, local, &global)) * 0.5;
         }
         Registration { local, transform, global, centers: mapped_centers, residual: Some(residual), penalty }
+    }
+
+    /// The same in 3D for a warp that has the point `origin` of the world as its own: what the warp turns, it turns about that
+    /// point. A camera that turns about its centre moves its whole picture; one that turns about what it sees does not.
+    pub fn about(
+        origin: [f64; 3],
+        warp: &dyn Warp,
+        at: &Points,
+        centers: Option<&Points>,
+        code: &Tensor,
+        pinned: bool,
+    ) -> Registration {
+        if origin == [0.0; 3] {
+            return Registration::new(warp, at, centers, code, pinned);
+        }
+        let origin = Tensor::constant(&origin);
+        let seen = |at: &Points| Points { position: &at.position - &origin, ..at.clone() };
+        let found = Registration::new(warp, &seen(at), centers.map(seen).as_ref(), code, pinned);
+        let (rotation, translation) = split_pose(&found.transform);
+        Registration {
+            local: found.local + &origin,
+            global: found.global + &origin,
+            centers: found.centers.map(|centers| centers + &origin),
+            transform: join_affine(&rotation, &(translation + &origin - apply(&rotation, &origin))),
+            ..found
+        }
     }
 }
 
