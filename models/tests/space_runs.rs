@@ -343,6 +343,7 @@ fn settings_that_do_not_fit_are_refused() {
         (&["field.kind=gaussian", "field.sigma=0.0"], ["`field.sigma`", "above 0"]),
         (&["radiance.init=zero"], ["`radiance.init`", "expected"]),
         (&["warp.output_scale=[0.0, 1.0]"], ["`warp.output_scale`", "two factors above 0"]),
+        (&["train.shear=true"], ["`train.relocalise_every`", "expected 0, found 1000"]),
         (&["warp.origin=[0.0, nan, 2.0]"], ["`warp.origin`", "expected a point"]),
     ] {
         let dir = tempfile::tempdir().unwrap();

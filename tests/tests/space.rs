@@ -214,7 +214,10 @@ fn refined_lenses() {
 /// The step that fits poses once more, on every device.
 #[test]
 fn poses_fitted_once_more() {
-    for (preset, set) in [("l2g-blender", &["train.refine_lens=focal"][..]), ("inn-llff", &[]), ("barf-blender", &[])] {
+    let turned = ["train.shear=true", "warp.origin=[0.1,-0.2,2.0]"];
+    for (preset, set) in
+        [("l2g-blender", &["train.refine_lens=focal"][..]), ("inn-llff", &turned), ("barf-blender", &[])]
+    {
         let model = model(preset, set);
         let step = model.fit(9);
         let mut bound = bind(&model, &step.roots(), &mut Rng(seed(preset)));

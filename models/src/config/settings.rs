@@ -101,6 +101,9 @@ pub struct TrainSettings {
     pub opaque_background: bool,
     pub refine_steps: usize,
     pub refine_lens: RefineLens,
+    /// Trains a shear of the world against which all cameras turn.
+    #[serde(default)]
+    pub shear: bool,
     /// Pixels along a side of the grid on which poses are fitted once more before they are measured; 0 for those of the last step.
     pub fit_grid: usize,
     /// Steps between two searches for lost cameras; 0 for none.
@@ -183,10 +186,15 @@ pub struct WarpSettings {
     /// Of rotations, and of translations.
     pub output_scale: [f64; 2],
     /// In 3D, the point of the world about which the warp turns cameras.
-    #[serde(default)]
+    #[serde(default, skip_serializing_if = "is_zero")]
     pub origin: [f64; 3],
     pub solver: Solver,
     pub inn: InnSettings,
+}
+
+/// Pictures have no such setting.
+fn is_zero(origin: &[f64; 3]) -> bool {
+    *origin == [0.0; 3]
 }
 
 /// The invertible networks ("invertible", "multi-invertible").

@@ -124,6 +124,10 @@ impl Layered {
             );
             return Err(self.refuse("train.range", text));
         }
+        if train.shear && train.relocalise_every > 0 {
+            let text = "cameras that turn against a shear (`train.shear`) cannot be put elsewhere: expected 0, found";
+            return Err(self.refuse("train.relocalise_every", format!("{text} {}", train.relocalise_every)));
+        }
         if train.error_map > MOST_CELLS {
             let text = format!("expected at most {MOST_CELLS} cells along a side, found {}", train.error_map);
             return Err(self.refuse("train.error_map", text));

@@ -13,6 +13,7 @@ pub mod rays;
 mod relocalise;
 mod rendering;
 pub mod results;
+pub mod shear;
 
 pub use data::SpaceData;
 pub use explorer::{Explorer, Rendered};

@@ -16,7 +16,8 @@ use super::error_map::ErrorMap;
 use super::lens::Lens;
 use super::rays::{Cameras, ImageSize, Rays, range_of};
 use super::rendering::{Purpose, Rendering, Seen};
-use crate::config::{DepthSettings, RadianceSettings, SceneSettings, Settings, TrainSettings, WarpSettings};
+use super::shear::Shear;
+use crate::config::{DepthSettings, Method, RadianceSettings, SceneSettings, Settings, TrainSettings, WarpSettings};
 use crate::scene::View;
 use crate::training::optimise::{STEP, hold_first, keep_averages, scales_loss, update_of, updates};
 use crate::warps::{self, Registration, Warp};
@@ -71,6 +72,7 @@ pub struct RadianceModel {
     warp: Arc<dyn Warp>,
     rendering: Rendering,
     lens: Lens,
+    shear: Shear,
     frame: Axis,
     pixel: Axis,
     code: Option<Parameter>,
@@ -102,10 +104,12 @@ impl RadianceModel {
         let frame = warp.frame().cloned().unwrap_or_else(|| Axis::new("frame", views));
         let pixel = Axis::new("pixel", size.pixels());
         let code = warps::codes(&*warp, &frame);
-        let (rendering, lens) = (Rendering::new(settings)?, Lens::new(train.refine_lens));
+        let (lens, shear) =
+            (Lens::new(train.refine_lens), Shear::new(train.shear && settings.warp.method != Method::None));
+        let rendering = Rendering::new(settings, &shear)?;
         let scales_loss = scales_loss(settings.run.precision, TargetKind::Gpu);
         let (settings, train) = (settings.clone(), train.clone());
-        Ok(RadianceModel { settings, size, train, warp, rendering, lens, frame, pixel, code, scales_loss })
+        Ok(RadianceModel { settings, size, train, warp, rendering, lens, shear, frame, pixel, code, scales_loss })
     }
 
     /// The model whose steps run on devices of this kind.
@@ -126,7 +130,8 @@ impl RadianceModel {
 
     /// What is trained at the warp's rate.
     fn camera_parameters(&self) -> Vec<Parameter> {
-        self.code.iter().chain(&self.lens.correction).cloned().chain(self.warp.parameters()).collect()
+        let own = self.code.iter().chain(&self.lens.correction).chain(&self.shear.parameter);
+        own.cloned().chain(self.warp.parameters()).collect()
     }
 
     /// Rays of every image in one step.
@@ -171,7 +176,7 @@ impl RadianceModel {
         let (rough, intrinsics) = (self.rough_poses(), self.intrinsics());
         let found = self.registered(ray, index);
         let center = found.centers.as_ref().unwrap_or(&found.local);
-        let rays = Rays::through(center, &found.local);
+        let rays = self.shear.turned(Rays::through(center, &found.local));
         let known = self.known_poses();
         let range = match self.train.depth {
             DepthSettings::Auto => range_of(&compose_poses(&rough, &known), &self.frame),
@@ -189,7 +194,7 @@ impl RadianceModel {
             Some((penalty, weight)) if *weight != 0.0 => aligned + penalty * *weight,
             _ => aligned,
         };
-        let transform = self.along_frames(&found.transform);
+        let transform = self.found_poses(&found.transform);
         let mut outputs = vec![("render", render), ("total", total.clone()), ("found", transform.clone())];
         outputs.extend(fine.map(|f| ("render_fine", f)));
         outputs.extend(found.residual.map(|r| ("alignment", r)));
@@ -219,7 +224,7 @@ impl RadianceModel {
     pub fn fit(&self, pixels: usize) -> Step {
         let ray = Axis::new("ray", pixels);
         let index = Tensor::data(FIT_PIXELS, Shape::new(&[&ray], 1).with_dtype(DType::U32));
-        let transform = self.along_frames(&self.registered(&ray, &index).transform);
+        let transform = self.found_poses(&self.registered(&ray, &index).transform);
         Step { outputs: vec![("found".into(), transform.clone())], updates: vec![(self.known_poses(), transform)] }
     }
 
@@ -267,8 +272,10 @@ impl RadianceModel {
         let points = Tensor::data(DENSITY_POINTS, Shape::new(&[&Axis::new("place", count)], 3));
         Step { outputs: vec![("density".to_string(), self.rendering.density_at(&points))], updates: vec![] }
     }
-    fn along_frames(&self, transform: &Tensor) -> Tensor {
-        transform.broadcast_to(&Axes::new([self.frame.clone()]))
+
+    /// What is found between the rough poses and the true ones where the warp does `transform`.
+    fn found_poses(&self, transform: &Tensor) -> Tensor {
+        self.shear.turned_pose(transform, &self.rough_poses()).broadcast_to(&Axes::new([self.frame.clone()]))
     }
     fn rough_poses(&self) -> Tensor {
         Tensor::input(POSES, Role::State, Shape::new(&[&self.frame], (3, 4)))

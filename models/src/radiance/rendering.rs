@@ -5,6 +5,7 @@
 
 use super::model::{NotInSpace, sections, seeded_step};
 use super::rays::Rays;
+use super::shear::Shear;
 use crate::config::{DepthSettings, Settings, TrainSettings};
 use crate::fields::RadianceField;
 use crate::planar::model::weights;
@@ -39,6 +40,7 @@ pub struct Rendering {
     train: TrainSettings,
     /// Share of the light below which a rendered view's rays end.
     stop_below: f64,
+    shear: Shear,
     coarse: RadianceField,
     fine: Option<RadianceField>,
 }
@@ -58,11 +60,12 @@ impl Seen {
 }
 
 impl Rendering {
-    pub fn new(settings: &Settings) -> Result<Rendering, NotInSpace> {
+    /// Of fields in a world that is sheared.
+    pub fn new(settings: &Settings, shear: &Shear) -> Result<Rendering, NotInSpace> {
         let (_, train, radiance) = sections(settings)?;
         let coarse = RadianceField::new("field", &settings.field, radiance);
         let fine = (train.fine_samples > 0).then(|| RadianceField::new("fine", &settings.field, radiance));
-        Ok(Rendering { train: train.clone(), stop_below: radiance.stop_below, coarse, fine })
+        Ok(Rendering { train: train.clone(), stop_below: radiance.stop_below, shear: shear.clone(), coarse, fine })
     }
 
     pub fn parameters(&self) -> Vec<Parameter> {
@@ -79,7 +82,7 @@ impl Rendering {
 
     /// The density of the field that is shown, at points of the learned world.
     pub fn density_at(&self, points: &Tensor) -> Tensor {
-        self.fine.as_ref().unwrap_or(&self.coarse).density_at(points, &progress())
+        self.fine.as_ref().unwrap_or(&self.coarse).density_at(&self.shear.of_field(points), &progress())
     }
 
     /// Renders rays along `axes` of a camera with `intrinsics` (fx, fy, cx, cy) between the depths `near` and `far`. Depths
@@ -92,7 +95,7 @@ impl Rendering {
         axes: &Axes,
         purpose: Purpose,
     ) -> Seen {
-        let world = rays;
+        let world = Rays { origin: self.shear.of_field(&rays.origin), direction: self.shear.of_field(&rays.direction) };
         let rays = &if self.train.ndc { world.to_ndc(intrinsics) } else { world.clone() };
         let sample = Axis::new("sample", self.train.samples);
         let jitter = match purpose != Purpose::View && self.train.stratified {
