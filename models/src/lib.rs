@@ -51,6 +51,8 @@ pub mod warps;
 pub use error::Error;
 pub use estimate::{Estimate, Trial};
 pub use experiment::{Experiment, Observer, Outcome, Quiet, open_device};
+pub use raygrad_compiler as compiler;
+pub use raygrad_runtime as runtime;
 pub use raygrad_runtime::Device;
 
 /// The README's example compiles.
@@ -63,9 +65,15 @@ struct Readme;
 #[doc = include_str!("../../docs/new_warp.md")]
 struct NewWarp;
 
+/// The program of `docs/own_graph.md` runs.
+#[cfg(doctest)]
+#[doc = include_str!("../../docs/own_graph.md")]
+struct OwnGraph;
+
 /// What defining and training a warp takes. Ops are methods of [`Tensor`](prelude::Tensor), functions of them are listed in
 /// [`raygrad_compiler::functions`].
 pub mod prelude {
+    pub use crate::config::Dof;
     pub use crate::warps::{Points, Warp};
     pub use crate::{Device, Experiment};
     pub use raygrad_compiler::functions::along::{concat_along, slice_along};
@@ -77,5 +85,5 @@ pub mod prelude {
     pub use raygrad_compiler::functions::posenc::positional_encoding;
     pub use raygrad_compiler::functions::vector::{dot, norm, normalize};
     pub use raygrad_compiler::ops::pick::concat;
-    pub use raygrad_compiler::{Axis, Shape, Tensor};
+    pub use raygrad_compiler::{Axes, Axis, Shape, Tensor};
 }
