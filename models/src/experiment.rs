@@ -20,7 +20,7 @@ use crate::run::checkpoint::Checkpoint;
 use crate::run::metrics::{Entry, Metrics};
 use crate::run::{FolderError, RunFolder};
 use crate::training::{Training, Watch, due};
-use crate::warps::{self, Warp};
+use crate::warps::Warp;
 use raygrad_runtime::{Device, DeviceError};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -114,7 +114,9 @@ impl Experiment {
     }
 
     /// Registers by a warp of one's own instead of the settings' one.
-    pub fn warp(mut self, warp: impl Warp + 'static) -> Experiment {
+    /// The run remembers its type, `warp.own`, and is resumed and measured by a warp of that type only.
+    pub fn warp<W: Warp + 'static>(mut self, warp: W) -> Experiment {
+        self.layered.set_text("warp.own", std::any::type_name::<W>(), Origin::Option("Experiment::warp".into()));
         self.warp = Some(Arc::new(warp));
         self
     }
@@ -180,7 +182,7 @@ impl Experiment {
         if self.resume {
             data.check_run(&self.folder(), settings)?;
         }
-        let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings, settings.data.patches));
+        let warp = self.warp_of(settings.data.patches)?;
         Trainer::new(settings, data, warp, self.open(settings.run.precision)?)
     }
 
@@ -199,10 +201,15 @@ impl Experiment {
         if self.lpips.is_some() {
             Lpips::check_size(data.size.width, data.size.height)?;
         }
-        let warp = self.warp.clone().unwrap_or_else(|| warps::of_settings(settings, data.scene.train.len()));
+        let warp = self.warp_of(data.scene.train.len())?;
         let mut explorer = Explorer::new(settings, data, warp, self.open(settings.run.precision)?)?;
         explorer.lpips = self.lpips.clone();
         Ok(explorer)
+    }
+
+    /// The program's own warp, or the settings' one of so many frames.
+    fn warp_of(&self, frames: usize) -> Result<Arc<dyn Warp>, ConfigError> {
+        self.warp.clone().map_or_else(|| self.layered.built_in_warp(frames), Ok)
     }
 
     /// The model of the last checkpoint of the run in the folder that [`Experiment::out`] names.

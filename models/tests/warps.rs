@@ -352,3 +352,48 @@ fn cameras_turn_about_the_origin_of_a_warp() {
         }
     }
 }
+
+/// Two warps of the same shapes.
+#[derive(Debug)]
+struct Pushed;
+#[derive(Debug)]
+struct Pulled;
+
+impl Warp for Pushed {
+    fn map(&self, at: &Points, code: &Tensor) -> Tensor {
+        &at.xy + code
+    }
+    fn code_width(&self) -> usize {
+        2
+    }
+}
+impl Warp for Pulled {
+    fn map(&self, at: &Points, code: &Tensor) -> Tensor {
+        &at.xy - code
+    }
+    fn code_width(&self) -> usize {
+        2
+    }
+}
+
+/// A run belongs to the warp that it was made with, and is called after it.
+#[test]
+fn runs_of_a_programs_warp_go_on_with_that_warp() {
+    let dir = tempfile::tempdir().unwrap();
+    let run = dir.path().join("run");
+    let made = |e: Experiment| e.set("optim.steps=3").unwrap().out(&run);
+    made(tiny(Pushed)).train().unwrap_or_else(|e| panic!("{e}"));
+    let text = std::fs::read_to_string(run.join("config.toml")).unwrap();
+    assert!(text.contains("own = \"warps::Pushed\""), "{text}");
+    fn refused<T>(result: Result<T, raygrad::Error>) -> String {
+        result.err().expect("refused").to_string()
+    }
+    let other = refused(made(tiny(Pulled)).resume(true).train());
+    assert!(other.contains("`warp.own`") && other.contains("Pushed") && other.contains("Pulled"), "{other}");
+    let of_run = || Experiment::of_run(&run).unwrap_or_else(|e| panic!("{e}"));
+    let none = refused(of_run().restored());
+    assert!(none.contains("`warps::Pushed` is the warp of a program"), "{none}");
+    assert!(of_run().warp(Pushed).restored().is_ok());
+    assert_eq!(of_run().layered.settings.method_name(), "Pushed");
+    made(tiny(Pushed)).resume(true).train().unwrap_or_else(|e| panic!("{e}"));
+}

@@ -8,8 +8,10 @@ use super::error::{ConfigError, Origin};
 use super::leaves::{Leaf, leaves};
 use super::presets::{PRESETS, Preset};
 use super::settings::Settings;
+use crate::warps::{self, Warp};
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 use toml::{Table, Value};
 
 /// Settings together with where each value came from.
@@ -125,6 +127,17 @@ impl Layered {
     /// An error about the value of `key`.
     pub fn refuse(&self, key: &str, message: impl Into<String>) -> ConfigError {
         ConfigError::Value { origin: self.origin(key), key: key.to_string(), message: message.into() }
+    }
+
+    /// The warp of so many frames that the settings ask for. That of a program is not to be had from them.
+    pub fn built_in_warp(&self, frames: usize) -> Result<Arc<dyn Warp>, ConfigError> {
+        let own = &self.settings.warp.own;
+        if own.is_empty() {
+            return Ok(warps::of_settings(&self.settings, frames));
+        }
+        let text =
+            format!("`{own}` is the warp of a program: resume and measure its runs there, with `Experiment::warp`");
+        Err(self.refuse("warp.own", text))
     }
 
     /// The settings that hold for this scene, and would not for any other: keys and values.

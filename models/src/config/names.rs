@@ -10,7 +10,11 @@ impl Settings {
     /// `barf`, `garf`, `naive`, `noenc`, `l2g`, `l2g-noglobal`, `inn`, `multi-inn`, `mlp`, `implicit-mlp`, `se3-field`, `reference`,
     /// `gaussian-reference`, or `fixed` where poses are neither true nor learned. Variants of a method that the papers compare
     /// with it have names of their own: `inn-frozen-network`, `inn-frozen-code`, `inn-posenc`, `inn-extrinsic`.
-    pub fn method_name(&self) -> &'static str {
+    /// A warp of a program's own has the name of its type.
+    pub fn method_name(&self) -> &str {
+        if !self.warp.own.is_empty() {
+            return self.warp.own.rsplit("::").next().unwrap_or(&self.warp.own);
+        }
         let (inn, encoding) = (&self.warp.inn, self.field.encoding);
         match self.warp.method {
             Method::None if self.scene.as_ref().is_some_and(|s| s.poses_in(s.layout()) != "truth") => "fixed",

@@ -176,6 +176,9 @@ pub struct Noise {
 #[serde(deny_unknown_fields)]
 pub struct WarpSettings {
     pub method: Method,
+    /// The type of the program's own warp that takes the place of `method`'s.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub own: String,
     pub dof: Dof,
     pub fix_first: bool,
     pub code: usize,

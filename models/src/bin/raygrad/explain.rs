@@ -10,7 +10,6 @@ use raygrad::radiance::data::SpaceDataError;
 use raygrad::radiance::{RadianceModel, SpaceData};
 use raygrad::run::files::{WriteError, write_atomically};
 use raygrad::training::learner::{compiled, untried};
-use raygrad::warps;
 use raygrad_compiler::fuse::TargetKind;
 use raygrad_compiler::graph::topological;
 use raygrad_compiler::plan::explain::Measured;
@@ -181,13 +180,13 @@ fn record(experiment: &Experiment, target: TargetKind) -> Result<(Step, Duration
         let settings = &data.with_depths(settings);
         let views = data.scene.train.len();
         let begun = Instant::now();
-        let warp = warps::of_settings(settings, views);
+        let warp = experiment.layered.built_in_warp(views).map_err(raygrad::Error::from)?;
         let model = RadianceModel::new(settings, data.size, views, warp).map_err(SpaceDataError::from)?;
         return Ok((model.for_target(target).train_step(), begun.elapsed()));
     }
     let data = PlanarData::load(&experiment.layered)?;
     let begun = Instant::now();
-    let warp = warps::of_settings(settings, settings.data.patches);
+    let warp = experiment.layered.built_in_warp(settings.data.patches).map_err(raygrad::Error::from)?;
     Ok((PlanarModel::new(settings, data.grid, warp).for_target(target).train_step(), begun.elapsed()))
 }
 
