@@ -32,7 +32,7 @@ pub use lpips::{Lpips, WeightsError};
 pub use mesh::{DensityError, Mesh, MeshError, MeshOptions};
 pub use mesh_reader::MeshFileError;
 pub use novel_path::{FRAMES, anchor, novel_view_path};
-pub use pose_error::{PoseErrors, pose_errors, rotation_angle};
+pub use pose_error::{PoseErrors, common_turn, pose_errors, rotation_angle};
 pub use published::{PublishedRow, PublishedTable, published, published_for, published_of};
 pub use scores::{Evaluation, FoundLens, Measured, Metric, Scores, Stage, ViewScores, success_px};
 pub use table::{Cell, Row, Table};

@@ -7,6 +7,7 @@
 
 use super::align::{PoseSetError, check_pairs};
 use crate::geometry::Pose;
+use crate::scene::nearest_rotation;
 use nalgebra::Matrix3;
 
 /// Errors per camera, in the order of the cameras.
@@ -59,6 +60,17 @@ pub fn pose_errors(aligned: &[Pose], reference: &[Pose]) -> Result<PoseErrors, P
     })
 }
 
+/// Angle in radians, with the published clamp, of the turn that all cameras share: by which orientations differ from those of
+/// the reference on the whole (their chordal mean) once the centres are aligned.
+///
+/// # Errors
+/// As of [`pose_errors`].
+pub fn common_turn(aligned: &[Pose], reference: &[Pose]) -> Result<f64, PoseSetError> {
+    check_pairs(aligned, reference)?;
+    let turns = aligned.iter().zip(reference).map(|(a, b)| a.rotation.transpose() * b.rotation);
+    Ok(rotation_angle(&nearest_rotation(&turns.sum()), &Matrix3::identity()))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -78,5 +90,23 @@ mod tests {
         assert!((errors.rotation_deg()[1] - 0.025_623).abs() < 1e-5);
         assert!((errors.mean_rotation_deg() - (0.5f64.to_degrees() + 0.025_623) / 2.0).abs() < 1e-5);
         assert!(pose_errors(&[turned], &[reference; 2]).is_err());
+    }
+
+    /// Cameras that look different ways, turned about one axis of the world and a little each for itself.
+    #[test]
+    fn what_cameras_turn_by_together() {
+        let reference: Vec<Pose> =
+            (0..6).map(|i| Pose::exp(&[0.5 * f64::from(i), 0.3, -0.2 * f64::from(i), 1.0, 2.0, 3.0])).collect();
+        let turned = |by: f64, own: f64| -> Vec<Pose> {
+            let world = Pose::exp(&[0.0, by, 0.0, 0.0, 0.0, 0.0]);
+            let own = |i: usize| Pose::exp(&[if i.is_multiple_of(2) { own } else { -own }, 0.0, 0.0, 0.0, 0.0, 0.0]);
+            reference.iter().enumerate().map(|(i, pose)| pose.after(&world).after(&own(i))).collect()
+        };
+        for (by, own) in [(0.1, 0.0), (0.1, 0.05), (-0.02, 0.05)] {
+            let found = common_turn(&turned(by, own), &reference).unwrap();
+            assert!((found - by.abs()).abs() < 1e-4, "{found} instead of {by}");
+        }
+        assert!(common_turn(&turned(0.0, 0.05), &reference).unwrap() < 5e-4);
+        assert!(common_turn(&reference[..5], &reference).is_err());
     }
 }

@@ -241,7 +241,7 @@ impl Stage {
 }
 
 /// One run, measured.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Evaluation {
     pub scene: String,
     pub method: String,
@@ -259,6 +259,10 @@ pub struct Evaluation {
     /// [`Similarity::is_ill_conditioned`](super::Similarity::is_ill_conditioned).
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub undetermined: bool,
+    /// The part of the rotation errors that is one turn of all cameras, in degrees: centres that are nearly in a plane may lie in
+    /// it as they should while everything leans.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub common_turn_deg: Option<f64>,
     /// Where lenses were refined, what was found.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub lens: Option<FoundLens>,

@@ -204,6 +204,7 @@ mod tests {
         let picture = |psnr_db| Scores { psnr_db: Some(psnr_db), ..Scores::default() };
         Evaluation {
             undetermined: false,
+            common_turn_deg: None,
             lens: None,
             scene: scene.into(),
             method: method.into(),

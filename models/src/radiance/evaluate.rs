@@ -44,6 +44,7 @@ pub fn evaluate(
     let (poses, lens) = (explorer.poses()?, explorer.found_lens()?);
     let similarity = data.similarity(&poses).map_err(SpaceDataError::from)?;
     let cameras = data.pose_scores(&poses).map_err(SpaceDataError::from)?;
+    let common_turn_deg = data.common_turn_deg(&poses).map_err(SpaceDataError::from)?;
     let settings = &explorer.settings;
     let (scene, method) = (settings.scene_name(), settings.method_name().to_string());
     let steps = refine_steps(settings);
@@ -67,7 +68,7 @@ pub fn evaluate(
     }
     let measured = |views: Vec<ViewScores>| (!views.is_empty()).then(|| Measured::new(views));
     let (before, after, undetermined) = (measured(before), measured(after), similarity.is_ill_conditioned());
-    let evaluation = Evaluation { scene, method, cameras, before, after, undetermined, lens };
+    let evaluation = Evaluation { scene, method, cameras, before, after, undetermined, common_turn_deg, lens };
     Ok(Found { evaluation, poses, similarity })
 }
 

@@ -134,7 +134,9 @@ pub fn summary(views: usize, last: &Final, evaluation: Option<&Evaluation>) -> S
     // What was evaluated: a run that ends with averages, or fits its poses once more, ends elsewhere than its last step.
     let mean = |metric| evaluation.and_then(|e| e.cameras.mean.get(metric));
     if let (Some(r), Some(t)) = (mean(Metric::RotationErrorDeg), mean(Metric::TranslationErrorX100)) {
-        text += &format!("rotation error     {r:.3} deg (mean over {views} training views)\n");
+        let shared =
+            evaluation.and_then(|e| e.common_turn_deg).map_or(String::new(), |d| format!(", {d:.3} shared by all"));
+        text += &format!("rotation error     {r:.3} deg (mean over {views} training views{shared})\n");
         text += &format!("translation error  {t:.3} x 0.01\n");
     }
     for metric in Metric::ALL.into_iter().filter(|m| m.is_of_views()) {

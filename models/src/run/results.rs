@@ -51,8 +51,7 @@ pub fn write_evaluation(
     let below = success_px(grid.height, grid.width);
     cameras.mean.success = cameras.mean.corner_error_px.map(|e| if e < below { 1.0 } else { 0.0 });
     let (scene, method) = (settings.scene_name(), settings.method_name().to_string());
-    let (before, after, undetermined, lens) = (None, None, false, None);
-    let evaluation = evaluation::Evaluation { scene, method, cameras, before, after, undetermined, lens };
+    let evaluation = evaluation::Evaluation { scene, method, cameras, ..evaluation::Evaluation::default() };
     folder.write("evaluation.json", evaluation.to_json().as_bytes())?;
     Ok(evaluation)
 }

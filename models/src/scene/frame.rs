@@ -46,7 +46,7 @@ impl WorldFrame {
 }
 
 /// The rotation nearest to a matrix (polar decomposition by SVD).
-pub(super) fn nearest_rotation(m: &Matrix3<f64>) -> Matrix3<f64> {
+pub(crate) fn nearest_rotation(m: &Matrix3<f64>) -> Matrix3<f64> {
     let svd = m.svd(true, true);
     match (svd.u, svd.v_t) {
         (Some(u), Some(v_t)) => {

@@ -29,6 +29,7 @@ mod transforms;
 pub use dtu::DtuSplit;
 pub use error::SceneError;
 pub use frame::WorldFrame;
+pub(crate) use frame::nearest_rotation;
 pub use named_poses::{NamedPoses, World};
 pub use noise::{InitialPoses, NoiseError, PoseStart};
 
