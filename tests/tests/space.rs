@@ -3,7 +3,9 @@
 use raygrad::config::Layered;
 use raygrad::geometry::Pose;
 use raygrad::radiance::RadianceModel;
-use raygrad::radiance::model::{FIT_PIXELS, FOUND, INTRINSICS, POSES, nothing_found};
+use raygrad::radiance::model::{
+    FIT_PIXELS, FOUND, INTRINSICS, POSES, VIEW_FIRST, VIEW_INTRINSICS, VIEW_POSE, nothing_found,
+};
 use raygrad::radiance::rays::ImageSize;
 use raygrad::training::Rates;
 use raygrad::warps;
@@ -16,7 +18,7 @@ use raygrad_compiler::ops::input::{Input, Role};
 use raygrad_compiler::plan::region::Grain;
 use raygrad_compiler::reference::{Array, Bindings, evaluate};
 use raygrad_compiler::scalar::DType;
-use raygrad_compiler::{Program, Step, Target, compile};
+use raygrad_compiler::{Axis, Program, Shape, Step, Target, compile};
 use raygrad_runtime::{Device, Precision};
 use raygrad_tests::backend::{devices, devices_for_large_programs, reference, round, run};
 use raygrad_tests::check::check;
@@ -226,6 +228,42 @@ fn poses_fitted_once_more() {
         }
         check(&devices(), &step, &bound).unwrap_or_else(|e| panic!("{preset}: {e}"));
     }
+}
+
+/// What a step compares with photos is what views from the poses that it finds show.
+#[test]
+fn a_step_sees_what_its_poses_say() {
+    let set = ["train.stratified=false", "train.shear=true", "warp.origin=[0.1,-0.2,2.0]"];
+    let model = model("barf-llff", &set);
+    let (ray, frame) = (Axis::new("ray", 4), model.frame().clone());
+    let index = Tensor::data("index", Shape::new(&[&ray], 1).with_dtype(DType::U32));
+    let step = model.step_at(&ray, &index, &Tensor::data("colors", Shape::new(&[&frame, &ray], 3)));
+    let (render, found) = (output(&step, "render"), output(&step, "found"));
+    let pixels = [3u32, 12, 29, 47];
+    let mut bound = bind(&model, &step.roots(), &mut Rng(seed("a step")));
+    bound.insert("index".into(), Array::integers(index.shape(), pixels.to_vec()));
+    bound.get_mut("colors").expect("an input").f_mut().fill(0.0);
+    let values = evaluate(&[render, found], &bound).expect("is evaluated");
+    let (seen, found) = (values[0].f()[0], values[1].f().to_vec());
+    let color = output(&model.view(SIZE.pixels()), "color");
+    let squares: f64 = found
+        .chunks(12)
+        .zip(bound[POSES].f().to_vec().chunks(12))
+        .map(|(found, rough)| {
+            let pose = Pose::from_rows(rough).after(&Pose::from_rows(found));
+            let mut bound = bound.clone();
+            let floats = |values: &[f64], width: usize| Array::floats(&Shape::new(&[], width), values.to_vec());
+            let placed = Array::floats(&Shape::new(&[], (3, 4)), pose.to_rows().to_vec());
+            bound.insert(VIEW_POSE.into(), placed);
+            bound.insert(VIEW_INTRINSICS.into(), floats(&[10.0, 11.0, 4.0, 3.0], 4));
+            bound.insert(VIEW_FIRST.into(), Array::integers(&Shape::new(&[], 1).with_dtype(DType::U32), vec![0]));
+            let shown = evaluate(std::slice::from_ref(&color), &bound).expect("is evaluated").remove(0);
+            let of = |pixel: &u32| shown.f()[3 * *pixel as usize..][..3].iter().map(|c| c * c).sum::<f64>();
+            pixels.iter().map(of).sum::<f64>()
+        })
+        .sum();
+    let shown = squares / (3 * pixels.len() * VIEWS) as f64;
+    assert!((seen - shown).abs() < 1e-9 * shown && shown > 0.01, "{seen} in the step, {shown} in views");
 }
 
 #[test]
