@@ -290,6 +290,11 @@ fn a_run_leaves_poses_views_and_scores() {
     let metrics = json("metrics.json");
     assert_eq!(metrics["steps"].as_array().unwrap().len(), 3);
     assert_eq!(metrics["final"]["rotation_error_deg"], scores["cameras"]["mean"]["rotation_error_deg"]);
+    // What cameras share of their errors is no more than the largest of them.
+    let errors =
+        scores["cameras"]["views"].as_array().unwrap().iter().map(|v| v["rotation_error_deg"].as_f64().unwrap());
+    let shared = scores["common_turn_deg"].as_f64().unwrap();
+    assert!(shared > 0.0 && shared <= errors.fold(0.0, f64::max), "{shared} of {scores}");
     let plot = std::fs::read_to_string(run.join("cameras.svg")).unwrap();
     // Before and after: a frustum of eight lines for either pose of five cameras, and a line between the two.
     assert_eq!(plot.matches("<polyline").count(), 2 * 5 * (2 * 8 + 1));

@@ -3,7 +3,7 @@
 use super::model::{NotInSpace, sections};
 use super::rays::ImageSize;
 use crate::config::{ConfigError, DepthSettings, Layered, NoiseKind, Settings};
-use crate::evaluation::{Alignment, Measured, PoseSetError, Scores, Similarity, ViewScores, common_turn, pose_errors};
+use crate::evaluation::{Alignment, Measured, PoseSetError, Scores, Similarity, ViewScores, pose_errors};
 use crate::geometry::Pose;
 use crate::run::files::WriteError;
 use crate::scene::make_scene::{MakeError, MakeOptions, make_scene};
@@ -191,12 +191,6 @@ impl SpaceData {
             Some(truth) if truth.len() > 1 => self.alignment().fit(poses, truth),
             _ => Ok(Similarity::identity()),
         }
-    }
-
-    /// The turn that learned poses share after alignment, see [`common_turn`]; none where there is nothing to compare with.
-    pub fn common_turn_deg(&self, poses: &[Pose]) -> Result<Option<f64>, PoseSetError> {
-        let Some(truth) = self.truth.as_ref().filter(|t| t.len() > 1) else { return Ok(None) };
-        Ok(Some(common_turn(&self.similarity(poses)?.align(poses), truth)?.to_degrees()))
     }
 
     /// Errors of learned poses of the training views, after alignment; none where there is nothing to compare with.

@@ -7,7 +7,7 @@ use crate::Error;
 use crate::config::{Method, Settings};
 use crate::estimate::{Trial, timed};
 use crate::evaluation::{
-    Evaluation, Lpips, Measured, Picture, Scores, Similarity, ViewScores, depth_errors, psnr, ssim,
+    Evaluation, Lpips, Measured, Picture, Scores, Similarity, ViewScores, common_turn, depth_errors, psnr, ssim,
 };
 use crate::geometry::Pose;
 use crate::scene::View;
@@ -44,7 +44,9 @@ pub fn evaluate(
     let (poses, lens) = (explorer.poses()?, explorer.found_lens()?);
     let similarity = data.similarity(&poses).map_err(SpaceDataError::from)?;
     let cameras = data.pose_scores(&poses).map_err(SpaceDataError::from)?;
-    let common_turn_deg = data.common_turn_deg(&poses).map_err(SpaceDataError::from)?;
+    let truth = data.truth.as_ref().filter(|t| t.len() > 1);
+    let turn = truth.map(|truth| common_turn(&similarity.align(&poses), truth)).transpose();
+    let common_turn_deg = turn.map_err(SpaceDataError::from)?.map(f64::to_degrees);
     let settings = &explorer.settings;
     let (scene, method) = (settings.scene_name(), settings.method_name().to_string());
     let steps = refine_steps(settings);
