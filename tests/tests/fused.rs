@@ -1,6 +1,7 @@
 //! Small steps that fusion or lowering once got wrong, each on every device against the reference.
 
 use raygrad_compiler::Step;
+use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::functions::matrix::matmul;
 use raygrad_compiler::graph::{Axes, Axis, Shape, Tensor};
 use raygrad_compiler::ops::input::Role;
@@ -187,4 +188,22 @@ fn states_that_read_other_elements_of_themselves() {
     inputs.check(&[&s], &[(&s, &s.mean(&[&ray]))]);
     inputs.check(&[], &[(&s, &(&s - s.mean(&[&frame])))]);
     inputs.check(&[], &[(&s, &s.reverse_cumsum(&frame))]);
+}
+
+/// On the way back the inner sum is one over a gradient that is the same in every frame, several frames to a tile of a CPU.
+#[test]
+fn sums_along_lines_that_are_all_the_same() {
+    let (frame, ray) = (Axis::new("frame", 200), Axis::new("ray", 3));
+    let mut inputs = Inputs::new("lines");
+    let x = inputs.parameter("x", Shape::new(&[&frame, &ray], 5));
+    let w = inputs.parameter("w", Shape::new(&[], (5, 16)));
+    let y = x.linear(&w).tanh();
+    let both = concat([&y, &y.sum(&[&ray])]).sum(&[&frame]) * 0.01;
+    let along = (&both * both.sin()).sum_channels();
+    let gradients = grad(&along.sum(&[&ray]), &[&x, &w]);
+    inputs.check(&[&gradients[0], &gradients[1]], &[]);
+    // A maximum and a sum, of values that do not vary along the lines either.
+    let level = inputs.parameter("level", Shape::new(&[&ray], 5));
+    let same = level.broadcast_to(x.axes());
+    inputs.check(&[&(&x + same.sum(&[&ray]) * same.max_over(&[&ray]) + y.sum(&[&ray]).ch(0))], &[]);
 }

@@ -42,8 +42,10 @@ impl Tile<'_> {
     pub(super) unsafe fn row_reduce(&self, kind: Reduction, x: &Value, out: Place, full: bool) {
         for c in 0..x.places.len() {
             if !full {
+                // All lines of the tile are the same.
+                let line = self.program.line.min(self.rows);
                 // SAFETY: the output has one lane a channel.
-                unsafe { *self.at(out).add(c) = self.total(kind, x, c, 0..self.rows) };
+                unsafe { *self.at(out).add(c) = self.total(kind, x, c, 0..line) };
                 continue;
             }
             let out = self.at(out).wrapping_add(c * self.program.ld);
