@@ -27,8 +27,12 @@ pub enum StepError {
     NotAnInput { op: String, at: &'static Location<'static> },
     #[error("the new value of `{name}`, from {}, is {found}, expected {expected}", line(.at))]
     UpdateShape { name: String, expected: Box<Shape>, found: Box<Shape>, at: &'static Location<'static> },
-    #[error("two updates of `{name}`, the second from {}", line(.at))]
-    TwoUpdates { name: String, at: &'static Location<'static> },
+    #[error(
+        "two updates of `{name}`, recorded at {} and at {}; one name is one buffer: a parameter is listed once, and two networks \
+         have two prefixes",
+        line(.at[0]), line(.at[1])
+    )]
+    TwoUpdates { name: String, at: [&'static Location<'static>; 2] },
     #[error("`{op}` of {} goes over {domain}; a GPU counts to {} elements", line(.at), u32::MAX)]
     TooManyElements { op: String, domain: Axes, at: &'static Location<'static> },
     #[error("two outputs are called `{0}`")]
@@ -72,14 +76,15 @@ impl Step {
                 _ => names.insert(&input.name, (input, at)),
             };
         }
-        let mut updated = std::collections::HashSet::new();
+        let mut updated: HashMap<&str, &Tensor> = HashMap::new();
         for (target, value) in &self.updates {
             let Some(input) = target.op_as::<Input>().filter(|i| matches!(i.role, Role::Parameter | Role::State))
             else {
                 return Err(StepError::NotAnInput { op: target.op().name().into(), at: target.source() });
             };
-            if !updated.insert(&input.name) {
-                return Err(StepError::TwoUpdates { name: input.name.clone(), at: value.source() });
+            if let Some(before) = updated.insert(&input.name, target) {
+                let at = [before.source(), target.source()];
+                return Err(StepError::TwoUpdates { name: input.name.clone(), at });
             }
             let fits = value.shape().axes.is_subset(&input.shape.axes)
                 && value.width() == input.shape.channels.count()

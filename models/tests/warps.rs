@@ -169,6 +169,27 @@ fn promises_of_warps_are_checked() {
     check(&Promising { identity: false, ..plane }).unwrap_or_else(|e| panic!("{e}"));
 }
 
+/// What a warp says of its transform must fit its points; what does not is told with the line of the warp.
+#[test]
+fn transforms_that_do_not_fit_are_refused() {
+    let warp = |dof, global| Promising { map: |at, _| at.position.clone(), code: 3, global, dof, identity: false };
+    let refused = |coordinates: usize, warp: Promising, expected: &str| {
+        let (frame, point) = (Axis::new("frame", 3), Axis::new("point", 8));
+        let position = Tensor::data("position", Shape::new(&[&frame, &point], coordinates));
+        let at = Points { position: position.clone(), ..Points::planar(frame.clone(), point, position.slice(0..2)) };
+        let code = Tensor::parameter("code", Shape::new(&[&frame], 3));
+        let found = Registration::new(&warp, &at, None, &code, true);
+        let text = found.local.error().or(found.transform.error()).expect("refused").to_string();
+        assert!(text.contains(expected) && text.contains(" at models/tests/warps.rs"), "{text}");
+    };
+    refused(3, warp(Dof::Homography, None), "of points in space `Warp::dof` is Dof::Pose");
+    refused(2, warp(Dof::Pose, None), "`Warp::dof` is a group of the plane");
+    refused(2, warp(Dof::Rigid, Some(|code| code * 1.0)), "it has channels (3, 3) along [frame=3]");
+    let everywhere =
+        |code: &Tensor| (code + Tensor::index(&Axis::new("other", 2)).to_f32()).pick(&[0; 12]).reshape((3, 4));
+    refused(3, warp(Dof::Pose, Some(everywhere)), "it has channels (3, 4) along [frame=3]");
+}
+
 fn tiny(warp: impl Warp + 'static) -> Experiment {
     let sizes = ["data.image_size=[16,16]", "data.patch_crop=[8,8]", "data.points_per_patch=16", "run.device=cpu"];
     let small = Experiment::preset("planar-l2g-small").and_then(|e| sizes.iter().try_fold(e, |e, s| e.set(s)));

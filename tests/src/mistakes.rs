@@ -3,8 +3,9 @@
 use raygrad_compiler::functions::along::{concat_along, slice_along};
 use raygrad_compiler::functions::homography::{Solver, fit_homography};
 use raygrad_compiler::functions::inverse::{inverse, solve};
+use raygrad_compiler::functions::lie::cross;
 use raygrad_compiler::functions::loss::charbonnier;
-use raygrad_compiler::functions::matrix::matmul;
+use raygrad_compiler::functions::matrix::{compose_poses, matmul};
 use raygrad_compiler::functions::mlp::{Mlp, MlpSpec};
 use raygrad_compiler::functions::vector::norm;
 use raygrad_compiler::graph::{Axes, Axis, Shape, Tensor};
@@ -52,6 +53,14 @@ pub fn recorded() -> Vec<(&'static str, Tensor)> {
         ("a slice into an axis that is there", slice_along(&points, &ray, 0, &sample)),
         ("parts that do not fill an axis", concat_along(&[(&colour, &ray), (&points, &ray)], &part)),
         ("parts with other channels", concat_along(&[(&colour, &ray), (&points, &ray)], &Axis::new("both", 2048))),
+        ("a comparison of other channels", points.greater_than(&colour)),
+        ("a choice by a float", colour.select(&points, &points)),
+        ("the mean along an axis that is not there", colour.mean(&[&sample])),
+        ("the least along an axis that is not there", colour.min_over(&[&sample])),
+        ("the largest channel of an integer", count.argmax_channels()),
+        ("a pose that is none", compose_poses(&colour, &colour)),
+        ("a cross product of four channels", cross(&colour, &colour)),
+        ("a matrix too large to be solved", solve(&weights.slice(0..25).reshape((5, 5)), &points)),
         ("a Charbonnier loss without a width", charbonnier(&points, &other, 0.0)),
     ]
 }

@@ -1,10 +1,11 @@
 //! Parts of an axis, and axes put one after the other: gathers at positions, whose adjoints sum into them in order.
 
-use crate::graph::{Axis, Tensor};
+use crate::graph::{Axis, Tensor, function};
 
 /// Elements `start..start + into.size()` along `axis`, which the new axis `into` replaces.
 #[track_caller]
 pub fn slice_along(x: &Tensor, axis: &Axis, start: usize, into: &Axis) -> Tensor {
+    let _called = function("slice_along");
     if let Err(bad) = is_new("slice_along", &[x], into) {
         return bad;
     }
@@ -25,6 +26,7 @@ fn moved(x: &Tensor, axis: &Axis, into: &Axis, by: u32) -> Tensor {
 /// The parts one after the other along the new axis `into`: each a tensor and the axis of it that `into` replaces.
 #[track_caller]
 pub fn concat_along(parts: &[(&Tensor, &Axis)], into: &Axis) -> Tensor {
+    let _called = function("concat_along");
     let tensors: Vec<&Tensor> = parts.iter().map(|p| p.0).collect();
     if let Err(bad) = is_new("concat_along", &tensors, into) {
         return bad;

@@ -10,7 +10,7 @@
 //! interval with `exp(-a)` is taken only after the exponential, so neither pass meets infinity minus infinity.
 
 use super::expect_width;
-use crate::graph::{Axis, Tensor};
+use crate::graph::{Axis, Tensor, function};
 
 /// Length of the interval behind the last sample.
 pub const LAST_INTERVAL: f64 = 1e10;
@@ -50,6 +50,7 @@ pub struct Composite {
 /// uniform in 0..1, or 0.5 for the middle of every interval.
 #[track_caller]
 pub fn depth_samples(sample: &Axis, jitter: &Tensor, near: &Tensor, far: &Tensor, spread: Spread) -> Tensor {
+    let _called = function("depth_samples");
     let share = (Tensor::index(sample).to_f32() + jitter) * (1.0 / sample.size() as f64);
     spread.depth(&(near + share * (far - near)))
 }
@@ -73,6 +74,7 @@ pub fn composite_above(
     length: &Tensor,
     sample: &Axis,
 ) -> Composite {
+    let _called = function("composite");
     for (what, t) in [("densities", density), ("depths", depth), ("lengths", length)] {
         if let Err(bad) = expect_width("composite", what, t, 1) {
             return Composite { color: bad.clone(), depth: bad.clone(), opacity: bad.clone(), weights: bad };

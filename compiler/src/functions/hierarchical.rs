@@ -16,7 +16,7 @@
 
 use super::composite::Spread;
 use super::expect_width;
-use crate::graph::{Axis, Tensor};
+use crate::graph::{Axis, Tensor, function};
 
 /// Keeps the quotient finite in bins without weight.
 const EMPTY: f64 = 1e-8;
@@ -32,6 +32,7 @@ pub fn fine_depths(
     far: &Tensor,
     spread: Spread,
 ) -> Tensor {
+    let _called = function("fine_depths");
     if let Err(bad) = expect_width("fine_depths", "weights", weights, 1) {
         return bad;
     }
@@ -54,6 +55,7 @@ pub fn fine_depths(
 /// along `sample` come first. Nothing is differentiated through it.
 #[track_caller]
 pub fn merge_depths(depth: &Tensor, sample: &Axis, more: &Tensor, fine: &Axis, merged: &Axis) -> Tensor {
+    let _called = function("merge_depths");
     let (s, f) = (sample.size(), fine.size());
     if merged.size() != s + f {
         let problem = format!("{s} and {f} depths in a list of {}", merged.size());

@@ -13,7 +13,7 @@
 
 use super::expect_width;
 use super::matrix::{identity, matmul, solve_symmetric};
-use crate::graph::{Axes, Tensor};
+use crate::graph::{Axes, Tensor, function};
 use crate::ops::pick::concat;
 
 /// How the homography follows from `G = A^T A`.
@@ -34,6 +34,7 @@ const EPSILON: f64 = 1e-8;
 /// identity, and neither value nor gradient sees the points. Two identical point sets are such a case.
 #[track_caller]
 pub fn fit_homography(x: &Tensor, y: &Tensor, over: &Axes, solver: Solver, degenerate: Option<&Tensor>) -> Tensor {
+    let _called = function("fit_homography");
     for t in [x, y] {
         if let Err(bad) = expect_width("fit_homography", "points", t, 2) {
             return bad;

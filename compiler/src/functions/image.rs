@@ -4,7 +4,7 @@
 //! interpolation cell outside the image counts as 0.
 
 use super::expect_width;
-use crate::graph::{Axis, Tensor};
+use crate::graph::{Axis, Tensor, function};
 
 /// An image as a table: pixel (column, row) at position `row * width + column` of the axis `texel`.
 #[derive(Clone, Debug)]
@@ -20,6 +20,7 @@ impl ImageTable {
     /// the pixels if they are trained.
     #[track_caller]
     pub fn bilinear(&self, at: &Tensor) -> Tensor {
+        let _called = function("bilinear");
         if let Err(bad) = expect_width("bilinear", "coordinates", at, 2) {
             return bad;
         }
@@ -61,6 +62,7 @@ impl ImageTable {
 /// normalised grid fall on whole numbers.
 #[track_caller]
 pub fn isotropic_to_pixels(points: &Tensor, width: usize, height: usize) -> Tensor {
+    let _called = function("isotropic_to_pixels");
     let half = width.max(height) as f64 / 2.0;
     points * half + Tensor::constant(&[(width as f64 - 1.0) / 2.0, (height as f64 - 1.0) / 2.0])
 }

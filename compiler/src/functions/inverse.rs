@@ -4,7 +4,7 @@
 //! more unknowns see [`solve_symmetric`](super::matrix::solve_symmetric).
 
 use super::matrix::{apply, matmul};
-use crate::graph::{Channels, Tensor};
+use crate::graph::{Channels, Tensor, function};
 use crate::ops::custom::custom_adjoint;
 
 /// Most rows: the number of minors grows like `4^n`.
@@ -13,6 +13,7 @@ const MOST: usize = 4;
 /// Determinant of a matrix `(n, n)`, n at most 4; 1 channel.
 #[track_caller]
 pub fn determinant(a: &Tensor) -> Tensor {
+    let _called = function("determinant");
     match square(a, "determinant") {
         Ok(n) => minors(a, n, &[((0..n).collect(), (0..n).collect())]),
         Err(bad) => bad,
@@ -23,6 +24,7 @@ pub fn determinant(a: &Tensor) -> Tensor {
 /// itself, `-B^T g B^T`.
 #[track_caller]
 pub fn inverse(a: &Tensor) -> Tensor {
+    let _called = function("inverse");
     let n = match square(a, "inverse") {
         Ok(n) => n,
         Err(bad) => return bad,
@@ -48,6 +50,7 @@ pub fn inverse(a: &Tensor) -> Tensor {
 /// `A^-1 b` of a matrix `(n, n)`, n at most 4, and n channels.
 #[track_caller]
 pub fn solve(a: &Tensor, b: &Tensor) -> Tensor {
+    let _called = function("solve");
     match square(a, "solve") {
         Ok(n) if b.width() == n => apply(&inverse(a), b),
         Ok(n) => {
@@ -65,7 +68,12 @@ fn square(a: &Tensor, name: &'static str) -> Result<usize, Tensor> {
         Channels::Matrix(r, c) if r == c && r <= MOST => Ok(r),
         other => {
             let problem = format!("channels {other} are no square matrix of at most {MOST} rows");
-            Err(Tensor::misfit(name, &[a], problem, "reshape the channels to (n, n)"))
+            let hint = match other {
+                Channels::Matrix(r, c) if r == c => "solve_symmetric takes symmetric ones of up to 9 rows",
+                Channels::Matrix(..) => "a matrix (n, n) would fit",
+                Channels::Vector(_) => "reshape the channels to (n, n)",
+            };
+            Err(Tensor::misfit(name, &[a], problem, hint))
         }
     }
 }

@@ -1,10 +1,11 @@
 //! Losses between what was computed and what was seen; each is a mean over all axes and channels.
 
-use crate::graph::Tensor;
+use crate::graph::{Tensor, function};
 
 /// Mean of the squared differences.
 #[track_caller]
 pub fn mean_squared_error(a: &Tensor, b: &Tensor) -> Tensor {
+    let _called = function("mean_squared_error");
     let difference = a - b;
     (&difference * &difference).mean_all()
 }
@@ -12,6 +13,7 @@ pub fn mean_squared_error(a: &Tensor, b: &Tensor) -> Tensor {
 /// Mean of the absolute differences.
 #[track_caller]
 pub fn mean_absolute_error(a: &Tensor, b: &Tensor) -> Tensor {
+    let _called = function("mean_absolute_error");
     (a - b).abs().mean_all()
 }
 
@@ -19,6 +21,7 @@ pub fn mean_absolute_error(a: &Tensor, b: &Tensor) -> Tensor {
 /// Blanc-Feraud, Aubert, Barlaud, Two deterministic half-quadratic regularization algorithms for computed imaging, ICIP 1994).
 #[track_caller]
 pub fn charbonnier(a: &Tensor, b: &Tensor, epsilon: f64) -> Tensor {
+    let _called = function("charbonnier");
     // Beyond, the square is no normal number of single precision; NaN is in no range.
     if !(1e-18..=1e18).contains(&epsilon) {
         let hint = "epsilon is a small positive difference, such as 1e-3";

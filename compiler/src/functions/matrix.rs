@@ -3,7 +3,7 @@
 //! A product of small matrices is one pointwise multiplication of picked channels and a sum over groups of them, so it
 //! stays in registers and differentiates by the rules of those.
 
-use crate::graph::{Channels, Tensor};
+use crate::graph::{Channels, Tensor, function};
 use crate::ops::custom::custom_adjoint;
 use crate::ops::pick::concat;
 
@@ -20,6 +20,7 @@ fn eye(n: usize) -> Vec<f64> {
 /// Product of small matrices, `(m, k)` times `(k, n)`, element by element of the axes.
 #[track_caller]
 pub fn matmul(a: &Tensor, b: &Tensor) -> Tensor {
+    let _called = function("matmul");
     let (Channels::Matrix(m, k), Channels::Matrix(k2, n)) = (a.channels(), b.channels()) else {
         let hint = "reshape the channels to (m, k) and (k, n)";
         return Tensor::misfit("matmul", &[a, b], "both operands must be matrices", hint);
@@ -41,6 +42,7 @@ fn runs(count: usize, length: usize) -> Vec<Vec<u32>> {
 /// `A x`: a matrix `(m, k)` applied to a vector of `k` channels.
 #[track_caller]
 pub fn apply(a: &Tensor, x: &Tensor) -> Tensor {
+    let _called = function("apply");
     match a.channels() {
         Channels::Matrix(m, k) if x.width() == k => {
             let cycled: Vec<usize> = (0..m * k).map(|i| i % k).collect();
@@ -56,6 +58,7 @@ pub fn apply(a: &Tensor, x: &Tensor) -> Tensor {
 /// `R x + t` for an affine map `[R | t]`, `(m, k + 1)`, and `k` channels.
 #[track_caller]
 pub fn apply_affine(map: &Tensor, x: &Tensor) -> Tensor {
+    let _called = function("apply_affine");
     match map.channels() {
         Channels::Matrix(m, k1) if k1 == x.width() + 1 => {
             let (linear, offset) = split_affine(map, m, k1 - 1);
@@ -79,6 +82,7 @@ fn split_affine(map: &Tensor, m: usize, k: usize) -> (Tensor, Tensor) {
 /// `[R | t]` of a matrix `(m, k)` and `m` channels.
 #[track_caller]
 pub fn join_affine(linear: &Tensor, offset: &Tensor) -> Tensor {
+    let _called = function("join_affine");
     match linear.channels() {
         Channels::Matrix(m, k) if offset.width() == m => {
             let place = |i: usize| if i % (k + 1) < k { i / (k + 1) * k + i % (k + 1) } else { m * k + i / (k + 1) };
@@ -108,6 +112,7 @@ pub fn split_pose(pose: &Tensor) -> (Tensor, Tensor) {
 /// `outer` after `inner`: `[R2 R1 | R2 t1 + t2]` for poses `outer = [R2 | t2]`, `inner = [R1 | t1]`.
 #[track_caller]
 pub fn compose_poses(outer: &Tensor, inner: &Tensor) -> Tensor {
+    let _called = function("compose_poses");
     let ((r2, t2), (r1, t1)) = (split_pose(outer), split_pose(inner));
     join_affine(&matmul(&r2, &r1), &(apply(&r2, &t1) + t2))
 }
@@ -115,6 +120,7 @@ pub fn compose_poses(outer: &Tensor, inner: &Tensor) -> Tensor {
 /// Inverse of a rigid pose, `[R^T | -R^T t]`.
 #[track_caller]
 pub fn invert_pose(pose: &Tensor) -> Tensor {
+    let _called = function("invert_pose");
     let (rotation, translation) = split_pose(pose);
     let back = rotation.transpose();
     join_affine(&back, &-apply(&back, &translation))
@@ -126,6 +132,7 @@ pub const PROJECTION_EPSILON: f64 = 1e-8;
 /// `(q_x, q_y) / (q_z + 1e-8)` with `q = H (x, y, 1)`: a homography `(3, 3)` applied to two channels.
 #[track_caller]
 pub fn apply_homography(h: &Tensor, x: &Tensor) -> Tensor {
+    let _called = function("apply_homography");
     if h.channels() != Channels::Matrix(3, 3) {
         let problem = format!("channels {} are no homography", h.channels());
         return Tensor::misfit("apply_homography", &[h, x], problem, "a homography is (3, 3)");
@@ -148,6 +155,7 @@ const NEGATIVE: f64 = 1e-5;
 /// from eigenvectors: that loses all digits where eigenvalues meet, while the solution does not notice.
 #[track_caller]
 pub fn solve_symmetric(g: &Tensor, b: &Tensor) -> Tensor {
+    let _called = function("solve_symmetric");
     if !matches!(g.channels(), Channels::Matrix(r, c) if r == c && b.width() == r) {
         let problem = format!("channels {} are no system for {} channels", g.channels(), b.channels());
         let hint = "the matrix is (n, n), the right side has n channels";

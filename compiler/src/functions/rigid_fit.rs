@@ -7,7 +7,7 @@
 use super::expect_width;
 use super::lie::so2_exp;
 use super::matrix::{apply, join_affine};
-use crate::graph::{Axes, Tensor};
+use crate::graph::{Axes, Tensor, function};
 use crate::ops::pick::concat;
 
 /// Sum over `over`, counting what `t` does not depend on once for every element.
@@ -26,6 +26,7 @@ fn expect_points(name: &'static str, x: &Tensor, y: &Tensor, n: usize) -> Result
 /// Rotation about the origin, `(2, 2)`, that takes points `x` to `y`; the points lie along `over`.
 #[track_caller]
 pub fn fit_rotation_2d(x: &Tensor, y: &Tensor, over: &Axes) -> Tensor {
+    let _called = function("fit_rotation_2d");
     if let Err(bad) = expect_points("fit_rotation_2d", x, y, 2) {
         return bad;
     }
@@ -37,12 +38,14 @@ pub fn fit_rotation_2d(x: &Tensor, y: &Tensor, over: &Axes) -> Tensor {
 /// Translation that takes points `x` to `y`: the difference of their means.
 #[track_caller]
 pub fn fit_translation(x: &Tensor, y: &Tensor, over: &Axes) -> Tensor {
+    let _called = function("fit_translation");
     sum_all(&(y - x), over) * (1.0 / over.elements() as f64)
 }
 
 /// Rigid motion `[R | t]`, `(2, 3)`, that takes points `x` to `y`.
 #[track_caller]
 pub fn fit_rigid_2d(x: &Tensor, y: &Tensor, over: &Axes) -> Tensor {
+    let _called = function("fit_rigid_2d");
     let share = 1.0 / over.elements() as f64;
     let (mean_x, mean_y) = (sum_all(x, over) * share, sum_all(y, over) * share);
     let rotation = fit_rotation_2d(&(x - &mean_x), &(y - &mean_y), over);
@@ -53,6 +56,7 @@ pub fn fit_rigid_2d(x: &Tensor, y: &Tensor, over: &Axes) -> Tensor {
 /// Rigid motion `[R | t]`, `(3, 4)`, that takes points `x` to `y`, over all `pairs` (x, y) of point sets together.
 #[track_caller]
 pub fn fit_rigid_3d(pairs: &[(&Tensor, &Tensor)], over: &Axes) -> Tensor {
+    let _called = function("fit_rigid_3d");
     let Some((first_x, first_y)) = pairs.first() else {
         return Tensor::misfit("fit_rigid_3d", &[], "no points", "give at least one pair of point sets");
     };
@@ -110,6 +114,7 @@ fn horn_quaternion(s: &Tensor) -> Tensor {
 /// Rotation `(3, 3)` of a unit quaternion (w, x, y, z).
 #[track_caller]
 pub fn quaternion_rotation(q: &Tensor) -> Tensor {
+    let _called = function("quaternion_rotation");
     // The ten products, doubled: ww wx wy wz xx xy xz yy yz zz.
     let p = q.pick(&[0, 0, 0, 0, 1, 1, 1, 2, 2, 3]) * q.pick(&[0, 1, 2, 3, 1, 2, 3, 2, 3, 3]) * 2.0;
     let (ww, wx, wy, wz, xx, xy, xz, yy, yz, zz) = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9);

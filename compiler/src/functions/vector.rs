@@ -2,17 +2,19 @@
 //!
 //! Lengths and directions are those of `x / s` with s the largest `|x_i|`: squares of tiny and of huge numbers are out of range.
 
-use crate::graph::Tensor;
+use crate::graph::{Tensor, function};
 
 /// Inner product over the channels, 1 channel.
 #[track_caller]
 pub fn dot(a: &Tensor, b: &Tensor) -> Tensor {
+    let _called = function("dot");
     (a * b).sum_channels()
 }
 
 /// Euclidean length over the channels, 1 channel; its gradient is the direction, and 0 at 0.
 #[track_caller]
 pub fn norm(x: &Tensor) -> Tensor {
+    let _called = function("norm");
     let (scale, x) = scaled(x);
     dot(&x, &x).sqrt() * scale
 }
@@ -20,6 +22,7 @@ pub fn norm(x: &Tensor) -> Tensor {
 /// The direction `x / |x|`, as many channels; 0 with gradient 0 where `x` is 0.
 #[track_caller]
 pub fn normalize(x: &Tensor) -> Tensor {
+    let _called = function("normalize");
     let (_, x) = scaled(x);
     let length = dot(&x, &x).sqrt();
     let (zero, one) = (Tensor::scalar(0.0), Tensor::scalar(1.0));

@@ -10,7 +10,7 @@ use std::panic::Location;
 /// An op whose operands do not fit.
 #[derive(Clone, Debug)]
 pub struct RecordError {
-    /// Name of the op, as in [`crate::ops::Op::name`].
+    /// Name of the op, as in [`crate::ops::Op::name`], or of the function that records it.
     pub op: String,
     /// Shapes of the operands, in order, with the source line that made each.
     pub operands: Vec<(Shape, &'static Location<'static>)>,

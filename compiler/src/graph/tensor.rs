@@ -10,6 +10,7 @@ use crate::ops::{Op, input::Input};
 use crate::scalar::DType;
 use std::cell::Cell;
 use std::fmt;
+use std::marker::PhantomData;
 use std::panic::Location;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -31,20 +32,51 @@ pub struct Node {
 
 static NEXT: AtomicU64 = AtomicU64::new(0);
 
+/// On whose behalf tensors are recorded.
+#[derive(Clone, Copy)]
+struct Behalf {
+    source: Option<&'static Location<'static>>,
+    /// The function that the user called.
+    function: Option<&'static str>,
+}
+
 thread_local! {
-    static SOURCE: Cell<Option<&'static Location<'static>>> = const { Cell::new(None) };
+    static BEHALF: Cell<Behalf> = const { Cell::new(Behalf { source: None, function: None }) };
+}
+
+/// Until it is dropped, tensors are recorded on behalf of whom it was made for.
+pub struct Called {
+    before: Behalf,
+    /// Not for other threads.
+    _here: PhantomData<*const ()>,
+}
+
+impl Called {
+    fn new(of: Behalf) -> Called {
+        Called { before: BEHALF.replace(of), _here: PhantomData }
+    }
+}
+
+impl Drop for Called {
+    fn drop(&mut self) {
+        BEHALF.set(self.before);
+    }
 }
 
 /// Runs `f`; every tensor recorded inside gets the source line `at`. Used by the passes that record on a user's behalf.
 pub fn with_source<T>(at: &'static Location<'static>, f: impl FnOnce() -> T) -> T {
-    struct Reset(Option<&'static Location<'static>>);
-    impl Drop for Reset {
-        fn drop(&mut self) {
-            SOURCE.set(self.0);
-        }
-    }
-    let _reset = Reset(SOURCE.replace(Some(at)));
+    let _called = Called::new(Behalf { source: Some(at), ..BEHALF.get() });
     f()
+}
+
+/// The first line of a function of tensors: what does not fit in its body is told of the function `name` and its caller's line, or
+/// of the function that calls it as a part of its own body.
+#[track_caller]
+#[must_use = "it ends where it is dropped"]
+pub fn function(name: &'static str) -> Called {
+    let of = BEHALF.get();
+    let source = of.source.unwrap_or(Location::caller());
+    Called::new(Behalf { source: Some(source), function: of.function.or(Some(name)) })
 }
 
 impl Tensor {
@@ -56,7 +88,7 @@ impl Tensor {
 
     #[track_caller]
     pub fn record_arc(op: Arc<dyn Op>, inputs: Vec<Tensor>) -> Tensor {
-        let source = SOURCE.get().unwrap_or(Location::caller());
+        let source = BEHALF.get().source.unwrap_or(Location::caller());
         let shapes: Vec<Shape> = inputs.iter().map(|t| t.shape().clone()).collect();
         let poisoned = inputs.iter().find_map(|t| t.0.error.clone());
         let found = op.shape(&shapes).and_then(|shape| shape.check().map(|()| shape));
@@ -138,7 +170,7 @@ impl Tensor {
 
 fn record_error(op: &Arc<dyn Op>, inputs: &[Tensor], m: Misfit, source: &'static Location<'static>) -> RecordError {
     RecordError {
-        op: op.name().to_string(),
+        op: BEHALF.get().function.unwrap_or(op.name()).to_string(),
         operands: inputs.iter().map(|t| (t.shape().clone(), t.source())).collect(),
         problem: m.problem,
         hint: m.hint,

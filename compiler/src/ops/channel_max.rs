@@ -2,7 +2,7 @@
 
 use super::{Form, Op, Sample, expect_dtype, pointwise::unary, reduce::larger};
 use crate::cost::Work;
-use crate::graph::{Channels, Misfit, Shape, Tensor};
+use crate::graph::{Channels, Misfit, Shape, Tensor, function};
 use crate::reference::{Array, Lane};
 use crate::scalar::DType;
 
@@ -47,11 +47,16 @@ impl Tensor {
     /// Minimum over all channels.
     #[track_caller]
     pub fn min_channels(&self) -> Tensor {
+        let _called = function("min_channels");
         -(-self).max_channels()
     }
     /// The channel of the largest value as `u32`, of equal ones the first. NaN is larger than nothing.
     #[track_caller]
     pub fn argmax_channels(&self) -> Tensor {
+        let _called = function("argmax_channels");
+        if let Err(m) = expect_dtype(self.shape(), DType::F32, 0) {
+            return Tensor::misfit("argmax_channels", &[self], m.problem, m.hint);
+        }
         // Not the channel that equals the maximum: a value computed twice may differ in its rounding.
         let number = self.equal(self).select(self, &Tensor::scalar(f64::from(f32::MIN)));
         let mut most = number.ch(0);
@@ -67,6 +72,7 @@ impl Tensor {
     /// The channel of the smallest value, likewise.
     #[track_caller]
     pub fn argmin_channels(&self) -> Tensor {
+        let _called = function("argmin_channels");
         (-self).argmax_channels()
     }
 }

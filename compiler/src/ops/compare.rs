@@ -1,7 +1,7 @@
 //! Comparisons, `u32` 1 where true and 0 elsewhere; of floats or of integers.
 
-use super::pointwise::binary;
-use super::{Pointwise, Sample, map};
+use super::pointwise::{Map, binary};
+use super::{Op, Pointwise, Sample, map};
 use crate::graph::Tensor;
 use crate::reference::Lane;
 use crate::scalar::{DType, Prim, ScalarBuilder, Val};
@@ -78,6 +78,16 @@ fn compare(relation: Relation, a: &Tensor, b: &Tensor) -> Tensor {
     map(Compare { relation, dtype: a.dtype() }, &[a, b])
 }
 
+/// `b < a` or `b <= a` for the function `name` of a and b.
+#[track_caller]
+fn turned(name: &'static str, relation: Relation, a: &Tensor, b: &Tensor) -> Tensor {
+    let op = Map(Compare { relation, dtype: a.dtype() });
+    match op.shape(&[a.shape().clone(), b.shape().clone()]) {
+        Ok(_) => Tensor::record(op, &[b, a]),
+        Err(m) => Tensor::misfit(name, &[a, b], m.problem, m.hint),
+    }
+}
+
 impl Tensor {
     /// 1 where `self < other`, else 0.
     #[track_caller]
@@ -92,12 +102,12 @@ impl Tensor {
     /// 1 where `self > other`, else 0.
     #[track_caller]
     pub fn greater_than(&self, other: &Tensor) -> Tensor {
-        compare(Relation::Less, other, self)
+        turned("greater_than", Relation::Less, self, other)
     }
     /// 1 where `self >= other`, else 0.
     #[track_caller]
     pub fn greater_equal(&self, other: &Tensor) -> Tensor {
-        compare(Relation::LessEqual, other, self)
+        turned("greater_equal", Relation::LessEqual, self, other)
     }
     /// 1 where the two are equal, else 0.
     #[track_caller]
@@ -121,6 +131,8 @@ pub fn samples() -> Vec<Sample> {
         float("equal", |a, b| a.floor().equal(&b.floor())),
         integer("less_than of integers", Tensor::less_than),
         integer("less_equal of integers", Tensor::less_equal),
+        integer("greater_than of integers", Tensor::greater_than),
+        integer("greater_equal of integers", Tensor::greater_equal),
         integer("equal of integers", Tensor::equal),
     ]
 }

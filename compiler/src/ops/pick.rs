@@ -1,7 +1,7 @@
 //! Channels picked from operands: concatenation, slices, any rearrangement.
 
 use super::{Form, Op, Sample, SampleInput, expect_dtype};
-use crate::graph::{Axis, Channels, Misfit, Shape, Tensor};
+use crate::graph::{Axis, Channels, Misfit, Shape, Tensor, function};
 use crate::reference::Array;
 use std::sync::Arc;
 
@@ -94,11 +94,13 @@ impl Tensor {
     /// Channel `c` alone.
     #[track_caller]
     pub fn ch(&self, c: usize) -> Tensor {
+        let _called = function("ch");
         self.pick(&[c])
     }
     /// Channels `range`, for example `t.slice(0..3)`.
     #[track_caller]
     pub fn slice(&self, range: std::ops::Range<usize>) -> Tensor {
+        let _called = function("slice");
         self.pick(&range.collect::<Vec<_>>())
     }
     /// Any channels in any order, repeated or not.

@@ -2,7 +2,7 @@
 
 use super::{Form, Op, Reduction, Sample, SampleInput, expect_dtype};
 use crate::cost::Work;
-use crate::graph::{Axes, Axis, Misfit, Shape, Tensor};
+use crate::graph::{Axes, Axis, Misfit, Shape, Tensor, function};
 use crate::reference::Array;
 use crate::scalar::DType;
 
@@ -93,12 +93,14 @@ impl Tensor {
     /// Mean over the given axes.
     #[track_caller]
     pub fn mean(&self, over: &[&Axis]) -> Tensor {
+        let _called = function("mean");
         let over = Axes::new(over.iter().map(|a| (*a).clone()));
         self.sum_over(&over) * (1.0 / over.elements() as f64)
     }
     /// Mean over all axes and channels.
     #[track_caller]
     pub fn mean_all(&self) -> Tensor {
+        let _called = function("mean_all");
         let n = self.shape().lanes();
         self.sum_channels().sum_over(self.axes()) * (1.0 / n as f64)
     }
@@ -111,6 +113,7 @@ impl Tensor {
     /// Minimum over the given axes, likewise.
     #[track_caller]
     pub fn min_over(&self, over: &[&Axis]) -> Tensor {
+        let _called = function("min_over");
         -(-self).max_over(over)
     }
     /// The same values with all of `axes`: repeated along those this tensor lacks.

@@ -41,6 +41,10 @@ impl Tensor {
     /// `a` where this (`u32`) is not 0, `b` elsewhere.
     #[track_caller]
     pub fn select(&self, a: &Tensor, b: &Tensor) -> Tensor {
+        if self.dtype() == DType::F32 && self.error().is_none() {
+            let problem = format!("operand 1 must be u32, found {}", self.shape());
+            return Tensor::misfit("select", &[self, a, b], problem, "a comparison gives one: x.greater_than(&y)");
+        }
         map(Select, &[self, a, b])
     }
 }

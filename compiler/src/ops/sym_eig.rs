@@ -33,10 +33,13 @@ impl Op for SymEig {
             Channels::Matrix(r, c) if r == c && r == self.n && r <= 9 => {
                 Ok(inputs[0].clone().with_channels(Channels::Vector(self.n + self.n * self.n)))
             }
-            other => Err(Misfit::new(
-                format!("channels {other} are not a square matrix of at most 9 rows"),
-                "reshape the channels to (n, n)",
-            )),
+            other => {
+                let hint = match other {
+                    Channels::Matrix(..) => "",
+                    Channels::Vector(_) => "reshape the channels to (n, n)",
+                };
+                Err(Misfit::new(format!("channels {other} are not a square matrix of at most 9 rows"), hint))
+            }
         }
     }
     fn form(&self) -> Form {

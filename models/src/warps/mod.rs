@@ -158,7 +158,7 @@ impl Registration {
         let first = Tensor::index(&at.frame).equal(&Tensor::integers(&[0]));
         let held = pinned && !warp.zero_code_is_identity();
         let map = |at: &Points| {
-            let mapped = fitting(at, warp.map(at, code));
+            let mapped = fitting(at, warp.dof(), warp.map(at, code));
             if held { first.select(&at.position, &mapped) } else { mapped }
         };
         let (local, mapped_centers) = (map(at), centers.map(map));
@@ -172,6 +172,7 @@ impl Registration {
             (penalty, _) => penalty,
         };
         if let Some(transform) = warp.global(&at.frame, code) {
+            let transform = fitting_transform(&at.frame, warp.dof(), transform);
             let transform = if held { first.select(&neutral(warp.dof()), &transform) } else { transform };
             let global = local.clone();
             return Registration { local, transform, global, centers: mapped_centers, residual: None, penalty };
@@ -215,18 +216,41 @@ impl Registration {
     }
 }
 
-/// What a warp made of points, if these are points again: as many coordinates, along the axes of the points and no others.
-fn fitting(at: &Points, mapped: Tensor) -> Tensor {
+/// What a warp made of points, if these are points again: as many coordinates, along the axes of the points and no others; and if
+/// they have the transform that the warp says they have.
+fn fitting(at: &Points, dof: Dof, mapped: Tensor) -> Tensor {
+    if mapped.error().is_some() {
+        return mapped;
+    }
     let own = at.position.axes();
     let all = own.union(&Axes::new([at.frame.clone(), at.point.clone()]));
     let fits = own.is_subset(mapped.axes()) && mapped.axes().is_subset(&all) && mapped.width() == at.position.width();
-    if fits || mapped.error().is_some() {
-        return mapped;
+    let width = at.position.width();
+    if !fits {
+        let problem = "the points that are mapped (operand 1) do not become points (operand 2)";
+        let hint = format!("a map gives {width} channels along {own} and, where frames differ, [{}]", at.frame);
+        return with_source(mapped.source(), || Tensor::misfit("Warp::map", &[&at.position, &mapped], problem, hint));
     }
-    let (width, axes) = (at.position.width(), own);
-    let problem = "the points that are mapped (operand 1) do not become points (operand 2)";
-    let hint = format!("a map gives {width} channels along {axes} and, where frames differ, [{}]", at.frame);
-    with_source(mapped.source(), || Tensor::misfit("Warp::map", &[&at.position, &mapped], problem, hint))
+    if (dof == Dof::Pose) != (width == 3) {
+        let problem = format!("points of {width} coordinates have no transform `{dof:?}`");
+        let hint = match width {
+            3 => "of points in space `Warp::dof` is Dof::Pose",
+            _ => "of points in the plane `Warp::dof` is a group of the plane, Dof::Homography for instance",
+        };
+        return with_source(mapped.source(), || Tensor::misfit("Warp::dof", &[&at.position, &mapped], problem, hint));
+    }
+    mapped
+}
+
+/// The transform of each frame that a warp gives, if it is one.
+fn fitting_transform(frame: &Axis, dof: Dof, transform: Tensor) -> Tensor {
+    let (channels, axes) = (neutral(dof).channels(), Axes::new([frame.clone()]));
+    if transform.error().is_some() || (transform.channels() == channels && transform.axes().is_subset(&axes)) {
+        return transform;
+    }
+    let problem = format!("no transform `{dof:?}` of a frame");
+    let hint = format!("it has channels {channels} along {axes}");
+    with_source(transform.source(), || Tensor::misfit("Warp::global", &[&transform], problem, hint))
 }
 
 /// The transform that moves nothing.
