@@ -1,6 +1,5 @@
 //! Small steps that fusion or lowering once got wrong, each on every device against the reference.
 
-use raygrad_compiler::Step;
 use raygrad_compiler::autodiff::grad;
 use raygrad_compiler::functions::matrix::matmul;
 use raygrad_compiler::graph::{Axes, Axis, Shape, Tensor};
@@ -8,6 +7,7 @@ use raygrad_compiler::ops::input::Role;
 use raygrad_compiler::ops::pick::concat;
 use raygrad_compiler::reference::{Array, Bindings};
 use raygrad_compiler::scalar::DType;
+use raygrad_compiler::{Step, Target, compile};
 use raygrad_tests::backend::devices;
 use raygrad_tests::check::check;
 use raygrad_tests::{Rng, seed};
@@ -206,4 +206,24 @@ fn sums_along_lines_that_are_all_the_same() {
     let level = inputs.parameter("level", Shape::new(&[&ray], 5));
     let same = level.broadcast_to(x.axes());
     inputs.check(&[&(&x + same.sum(&[&ray]) * same.max_over(&[&ray]) + y.sum(&[&ray]).ch(0))], &[]);
+}
+
+/// What equals its maximum must be that very value, not one computed again in another launch, where it may be rounded otherwise.
+#[test]
+fn what_is_compared_with_its_maximum_is_computed_once() {
+    let (frame, ray) = (Axis::new("frame", 4), Axis::new("ray", 600));
+    let mut inputs = Inputs::new("maximum");
+    let x = inputs.parameter("x", Shape::new(&[&frame, &ray], 3));
+    let y = x.sin() + &x;
+    let channel = (&x * 3.0).sin() + 2.0;
+    let loss = (y.max_over(&[&ray]).exp() * channel.max_channels().mean(&[&ray])).mean_all();
+    let gradient = grad(&loss, &[&x]).remove(0);
+    inputs.check(&[&loss, &gradient], &[]);
+    let step = Step { outputs: vec![("gradient".into(), gradient)], updates: vec![] };
+    for target in [Target::cpu(), Target::gpu()] {
+        let program = compile(&step, &target).unwrap_or_else(|e| panic!("{e}"));
+        let labels = program.launches.iter().flat_map(|l| &l.region.body).map(|i| i.label.as_str());
+        let sines = labels.flat_map(|l| l.split('+')).filter(|l| *l == "sin").count();
+        assert_eq!(sines, 2, "{program}");
+    }
 }

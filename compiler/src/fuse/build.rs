@@ -54,7 +54,8 @@ pub fn fuse(roots: &[Tensor], target: Target) -> Fused {
             .map(|i| info.operands[i].clone())
             .filter(|o| builder.cuts.get(o).form != Form::Input)
             .collect();
-        for o in through_memory {
+        let once = builder.cuts.once.contains(&id).then(|| info.tensor.clone());
+        for o in through_memory.into_iter().chain(once) {
             builder.store(&o);
         }
         // Weights seen as a part of an input are not stored, but an input's own buffer must exist.

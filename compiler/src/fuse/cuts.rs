@@ -1,5 +1,6 @@
 //! Domains, free values, forced cuts and depths.
 
+use super::extremes::compared;
 use super::lines::{self, Copies};
 use super::resident::{After, Resident, after};
 use super::{Target, TargetKind};
@@ -97,6 +98,8 @@ pub(super) struct Cuts {
     pub target: Target,
     copies: Copies,
     resident: Resident,
+    /// Values that nobody computes again.
+    pub once: HashSet<u64>,
     /// Depth before which no region over a domain of whole lines starts.
     starts: HashMap<Axes, usize>,
 }
@@ -104,8 +107,8 @@ pub(super) struct Cuts {
 impl Cuts {
     pub fn new(roots: &[Tensor], target: Target) -> Cuts {
         let (copies, starts) = (Copies::default(), HashMap::new());
-        let resident = Resident::of(roots, target.resident);
-        let mut cuts = Cuts { nodes: HashMap::new(), order: vec![], target, copies, resident, starts };
+        let (resident, once) = (Resident::of(roots, target.resident), compared(roots));
+        let mut cuts = Cuts { nodes: HashMap::new(), order: vec![], target, copies, resident, once, starts };
         cuts.inspect_all(roots);
         let domains = lines::domains(&cuts);
         cuts.copies = lines::copies(&cuts, &domains);
@@ -235,6 +238,7 @@ impl Cuts {
             .fold(own, |a, b| a.saturating_add(b));
         info.free = match &info.form {
             Form::Input | Form::Const(_) | Form::Index { .. } => true,
+            _ if self.once.contains(&t.id()) => false,
             Form::Take { .. } => {
                 matches!(self.get(&info.operands[0]).form, Form::Input) && self.get(&info.operands[1]).free
             }

@@ -29,7 +29,7 @@ impl Op for ChannelMax {
     }
     fn vjp(&self, inputs: &[Tensor], output: &Tensor, g: &Tensor) -> Vec<Option<Tensor>> {
         let hit = inputs[0].equal(output).to_f32();
-        // At least one, also where rounding makes the maximum differ from its own operand.
+        // At least one: NaN equals nothing.
         let ties = hit.sum_channels().max(&Tensor::scalar(1.0));
         vec![Some(hit * (g / ties))]
     }

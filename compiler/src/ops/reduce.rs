@@ -60,7 +60,7 @@ impl Op for Reduce {
             Reduction::Sum => g.broadcast_to(x.axes()),
             Reduction::Max => {
                 let hit = x.equal(output).to_f32();
-                // At least one, also where rounding makes the maximum differ from its own operand.
+                // At least one: NaN equals nothing.
                 let ties = hit.sum_over(&self.over).max(&Tensor::scalar(1.0));
                 hit * (g / ties)
             }
