@@ -17,7 +17,7 @@ use std::sync::Mutex;
 
 /// Large graphs of a run.
 fn large() -> u64 {
-    if nightly() { 10_000 } else { 600 }
+    if nightly() { 10_000 } else { 1500 }
 }
 
 /// Graphs of a run that are small enough for a software GPU, which takes half a second each.

@@ -11,7 +11,7 @@
 use crate::config::{Count, Settings};
 use crate::fields::NeuralImage;
 use crate::geometry::Grid;
-use crate::training::optimise::{self, PROGRESS, STEP};
+use crate::training::optimise::{self, PROGRESS, STEP, Training};
 use crate::warps::{self, Points, Registration, Warp};
 use raygrad_compiler::functions::loss::mean_squared_error;
 use raygrad_compiler::functions::mlp::Parameter;
@@ -94,7 +94,7 @@ impl PlanarModel {
             Count::Of(_) => self.drawn_points(self.points_per_patch()),
         };
         let (found, render) = self.losses(&at, &target);
-        let total = self.total(&found, &render);
+        let total = found.loss(&render, self.settings.loss.alignment);
         Step { outputs: losses_and_transform(&found, render, &total), updates: self.updates(&total) }
     }
 
@@ -105,7 +105,7 @@ impl PlanarModel {
         let found = self.register(&at);
         let color = self.field.color(&found.local, &progress());
         let render = mean_squared_error(&color, &self.target());
-        let total = self.total(&found, &render);
+        let total = found.loss(&render, self.settings.loss.alignment);
         let fields = [("local", &found.local), ("global", &found.global), ("color", &color)];
         let all = Axes::new([self.frame.clone(), self.pixel.clone()]);
         let fields = fields.map(|(name, t)| (name.to_string(), t.broadcast_to(&all)));
@@ -126,18 +126,6 @@ impl PlanarModel {
         (found, render)
     }
 
-    /// A weight of zero removes the alignment term: its gradient is not even computed.
-    fn total(&self, found: &Registration, render: &Tensor) -> Tensor {
-        let weight = self.settings.loss.alignment;
-        let aligned = match &found.residual {
-            Some(residual) if weight > 0.0 => render + residual * weight,
-            _ => render.clone(),
-        };
-        match &found.penalty {
-            Some((penalty, weight)) if *weight != 0.0 => aligned + penalty * *weight,
-            _ => aligned,
-        }
-    }
     fn register(&self, at: &Points) -> Registration {
         let code = warps::code_tensor(self.code.as_ref());
         Registration::new(&*self.warp, at, None, &code, self.settings.warp.fix_first)
@@ -165,18 +153,15 @@ impl PlanarModel {
         (Points::planar(all.frame, point, xy), self.target().take(&index, &self.pixel))
     }
 
-    /// Adam on every parameter; where codes of zeros are the identity, the gauge is held by them.
     fn updates(&self, total: &Tensor) -> Vec<(Tensor, Tensor)> {
-        let warp: Vec<Parameter> = self.warp_parameters().collect();
-        let mut updates = optimise::updates(total, &self.field.parameters(), &warp, self.scales_loss);
-        let held = self.settings.warp.fix_first && self.warp.zero_code_is_identity();
-        if let Some(code) = self.code.as_ref().filter(|_| held) {
-            optimise::hold_first(&mut updates, &code.tensor, &self.frame);
-        }
-        optimise::keep_averages(&mut updates, &self.parameters(), &self.settings.optim);
-        updates
+        let (field, warp): (Vec<Parameter>, Vec<Parameter>) =
+            (self.field.parameters(), self.warp_parameters().collect());
+        let held = warps::held(&*self.warp, &self.settings.warp, self.code.as_ref(), &self.frame);
+        let (optim, scaled) = (&self.settings.optim, self.scales_loss);
+        Training { field: &field, warp: &warp, held, optim, scaled }.updates(total)
     }
 }
+
 fn progress() -> Tensor {
     Tensor::input(PROGRESS, Role::PerStep, Shape::new(&[], 1))
 }

@@ -19,7 +19,7 @@ use super::rendering::{Purpose, Rendering, Seen};
 use super::shear::Shear;
 use crate::config::{DepthSettings, Method, RadianceSettings, SceneSettings, Settings, TrainSettings, WarpSettings};
 use crate::scene::View;
-use crate::training::optimise::{STEP, hold_first, keep_averages, scales_loss, update_of, updates};
+use crate::training::optimise::{STEP, Training, scales_loss, update_of};
 use crate::warps::{self, Registration, Warp};
 use raygrad_compiler::functions::adam::StepScalars;
 use raygrad_compiler::functions::lie::se3_exp;
@@ -185,27 +185,17 @@ impl RadianceModel {
         let axes = Axes::new([self.frame.clone(), ray.clone()]);
         let seen = self.rendering.render(&rays, &intrinsics, &range, &axes, Purpose::Training);
         let Pictures { render, fine, both } = Pictures::new(&seen, colors);
-        let weight = self.settings.loss.alignment;
-        let aligned = match &found.residual {
-            Some(residual) if weight > 0.0 => both + residual * weight,
-            _ => both,
-        };
-        let total = match &found.penalty {
-            Some((penalty, weight)) if *weight != 0.0 => aligned + penalty * *weight,
-            _ => aligned,
-        };
+        let total = found.loss(&both, self.settings.loss.alignment);
         let transform = self.found_poses(&found.transform);
         let mut outputs = vec![("render", render), ("total", total.clone()), ("found", transform.clone())];
         outputs.extend(fine.map(|f| ("render_fine", f)));
         outputs.extend(found.residual.map(|r| ("alignment", r)));
         outputs.extend(found.penalty.map(|(p, _)| ("penalty", p)));
         let outputs = outputs.into_iter().map(|(name, t)| (name.to_string(), t)).collect();
-        let mut updates = updates(&total, &self.rendering.parameters(), &self.camera_parameters(), self.scales_loss);
-        let pinned = self.settings.warp.fix_first && self.warp.zero_code_is_identity();
-        if let (true, Some(code)) = (pinned, &self.code) {
-            hold_first(&mut updates, &code.tensor, &self.frame);
-        }
-        keep_averages(&mut updates, &self.parameters(), &self.settings.optim);
+        let (field, warp) = (self.rendering.parameters(), self.camera_parameters());
+        let held = warps::held(&*self.warp, &self.settings.warp, self.code.as_ref(), &self.frame);
+        let (optim, scaled) = (&self.settings.optim, self.scales_loss);
+        let mut updates = Training { field: &field, warp: &warp, held, optim, scaled }.updates(&total);
         updates.push((known, transform));
         updates.extend(map.map(|map| map.updated(&seen.best().color, colors)));
         Step { outputs, updates }

@@ -81,7 +81,7 @@ impl LossScale {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::training::optimise::{Rates, updates};
+    use crate::training::optimise::{Rates, Training};
     use raygrad_compiler::functions::mlp::{Init, Parameter};
     use raygrad_compiler::{Step, compile};
     use raygrad_runtime::{Device, ProgramId, Session};
@@ -94,12 +94,13 @@ mod tests {
         let factor = Tensor::data("factor", Shape::new(&[], LANES));
         let loss = (&p * factor).sum_channels();
         let parameter = Parameter { tensor: p, init: Init::Zero, trained: true };
-        let updates = updates(&loss, &[parameter], &[], true);
+        let optim = crate::config::Layered::load("planar-l2g").unwrap().settings.optim;
+        let training = Training { field: &[parameter], warp: &[], held: None, optim: &optim, scaled: true };
+        let updates = training.updates(&loss);
         let device = Device::cpu(Some(1)).unwrap();
         let mut session = Session::new(device.clone()).unwrap();
         let program = compile(&Step { outputs: vec![], updates }, &device.target()).unwrap();
         let program = session.add(program).unwrap();
-        let optim = crate::config::Layered::load("planar-l2g").unwrap().settings.optim;
         for (name, value) in Rates::at(&optim, 0).inputs() {
             if session.inputs().any(|(n, _)| n == name) {
                 session.set(name, &[value as f32]).unwrap();

@@ -101,44 +101,55 @@ pub fn update_of(loss: &Tensor, parameter: &Tensor, scalars: &StepScalars, scale
     adam(loss, &[(parameter, scalars)], scaled).0
 }
 
-/// What an Adam step makes of every trained parameter and its moments; field and warp have learning rates of their own. The
-/// loss may be `scaled`.
-pub fn updates(total: &Tensor, field: &[Parameter], warp: &[Parameter], scaled: bool) -> Updates {
-    let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
-    let scalars = |lr| StepScalars { lr: scalar(lr), bias1: scalar(BIAS1), bias2: scalar(BIAS2) };
-    let (of_field, of_warp) = (scalars(LR_FIELD), scalars(LR_WARP));
-    let all: Vec<(&Tensor, &StepScalars)> = (field.iter().map(|p| (p, &of_field)))
-        .chain(warp.iter().map(|p| (p, &of_warp)))
-        .filter_map(|(p, scalars)| p.trained.then_some((&p.tensor, scalars)))
-        .collect();
-    let (mut updates, scale) = adam(total, &all, scaled);
-    updates.extend(scale.into_iter().flat_map(|(scale, finite)| scale.updates(&finite)));
-    updates
+/// What a step trains, and how.
+pub struct Training<'a> {
+    pub field: &'a [Parameter],
+    /// What has the learning rate of warps.
+    pub warp: &'a [Parameter],
+    /// A parameter whose element 0 along an axis is zero after every step: it fixes the gauge. Its moments go on.
+    pub held: Option<(&'a Tensor, &'a Axis)>,
+    pub optim: &'a Optim,
+    /// Whether the loss is scaled.
+    pub scaled: bool,
 }
 
-/// Keeps averages of all `parameters` beside them, where `optim.average` asks for that: states [`AVERAGE_OF`] their names, which
-/// follow the values that `updates` gives them (Polyak and Juditsky 1992; here exponential).
-pub fn keep_averages(updates: &mut Updates, parameters: &[Parameter], optim: &Optim) {
-    if optim.average == 0 {
-        return;
+impl Training<'_> {
+    /// What an Adam step on the loss `total` makes of every trained parameter, its moments and its average.
+    pub fn updates(&self, total: &Tensor) -> Updates {
+        let scalar = |name| Tensor::per_step(name, Shape::new(&[], 1));
+        let scalars = |lr| StepScalars { lr: scalar(lr), bias1: scalar(BIAS1), bias2: scalar(BIAS2) };
+        let (of_field, of_warp) = (scalars(LR_FIELD), scalars(LR_WARP));
+        let all: Vec<(&Tensor, &StepScalars)> = (self.field.iter().map(|p| (p, &of_field)))
+            .chain(self.warp.iter().map(|p| (p, &of_warp)))
+            .filter_map(|(p, scalars)| p.trained.then_some((&p.tensor, scalars)))
+            .collect();
+        let (mut updates, scale) = adam(total, &all, self.scaled);
+        updates.extend(scale.into_iter().flat_map(|(scale, finite)| scale.updates(&finite)));
+        if let Some((parameter, axis)) = self.held {
+            let first = Tensor::index(axis).equal(&Tensor::integers(&[0]));
+            for (_, value) in updates.iter_mut().filter(|(input, _)| input.id() == parameter.id()) {
+                *value = first.select(&Tensor::scalar(0.0), value);
+            }
+        }
+        updates.extend(self.averages(&updates));
+        updates
     }
-    let rate = Tensor::per_step(AVERAGE, Shape::new(&[], 1));
-    let of = |(input, value): &(Tensor, Tensor)| {
-        let parameter = parameters.iter().find(|p| p.tensor.id() == input.id())?;
-        let name = format!("{AVERAGE_OF}{}", parameter.tensor.input_name()?);
-        let average = Tensor::input(name, Role::State, input.shape().clone());
-        let follows = &average + (value - &average) * &rate;
-        Some((average, follows))
-    };
-    let averages: Updates = updates.iter().filter_map(of).collect();
-    updates.extend(averages);
-}
 
-/// Makes the first frame's row of `parameter` zero after the step: it fixes the gauge. Its moments go on.
-pub fn hold_first(updates: &mut [(Tensor, Tensor)], parameter: &Tensor, frame: &Axis) {
-    let first = Tensor::index(frame).equal(&Tensor::integers(&[0]));
-    for (_, value) in updates.iter_mut().filter(|(input, _)| input.id() == parameter.id()) {
-        *value = first.select(&Tensor::scalar(0.0), value);
+    /// Averages of all that is trained, where `optim.average` asks for them: states [`AVERAGE_OF`] the parameters' names, which
+    /// follow the values that `updates` gives these (Polyak and Juditsky 1992; here exponential).
+    fn averages(&self, updates: &Updates) -> Updates {
+        if self.optim.average == 0 {
+            return vec![];
+        }
+        let rate = Tensor::per_step(AVERAGE, Shape::new(&[], 1));
+        let of = |(input, value): &(Tensor, Tensor)| {
+            let parameter = self.field.iter().chain(self.warp).find(|p| p.tensor.id() == input.id())?;
+            let name = format!("{AVERAGE_OF}{}", parameter.tensor.input_name()?);
+            let average = Tensor::input(name, Role::State, input.shape().clone());
+            let follows = &average + (value - &average) * &rate;
+            Some((average, follows))
+        };
+        updates.iter().filter_map(of).collect()
     }
 }
 
@@ -162,9 +173,8 @@ mod tests {
         let slope = Tensor::per_step("slope", Shape::new(&[], 1));
         let loss = ((&all[0].tensor + &all[1].tensor) * slope).sum(&[&frame]);
         let optim = Optim { average: 3, ..Layered::load("planar-l2g").unwrap().settings.optim };
-        let mut updates = updates(&loss, &all, &[], false);
-        hold_first(&mut updates, &all[0].tensor, &frame);
-        keep_averages(&mut updates, &all, &optim);
+        let held = Some((&all[0].tensor, &frame));
+        let updates = Training { field: &all, warp: &[], held, optim: &optim, scaled: false }.updates(&loss);
         let device = Device::cpu(Some(1)).unwrap();
         let mut session = Session::new(device.clone()).unwrap();
         let program = session.add(compile(&Step { outputs: vec![], updates }, &device.target()).unwrap()).unwrap();

@@ -19,7 +19,7 @@ pub use known::{KnownWarp, TRUTH as KNOWN_TRUTH};
 pub use local::LocalWarp;
 pub use plain::{ImplicitMlpWarp, MlpWarp, Se3Field};
 
-use crate::config::{Dof, Method, Settings, Solver};
+use crate::config::{Dof, Method, Settings, Solver, WarpSettings};
 use raygrad_compiler::functions::matrix::{apply, identity, join_affine, split_pose};
 use raygrad_compiler::functions::mlp::{Init, Parameter};
 use raygrad_compiler::graph::with_source;
@@ -189,6 +189,19 @@ impl Registration {
         Registration { local, transform, global, centers: mapped_centers, residual: Some(residual), penalty }
     }
 
+    /// The loss of a step: `render`, `alignment` times the residual, and the warp's own term. A weight of zero removes a term: its
+    /// gradient is not even computed.
+    pub fn loss(&self, render: &Tensor, alignment: f64) -> Tensor {
+        let aligned = match &self.residual {
+            Some(residual) if alignment > 0.0 => render + residual * alignment,
+            _ => render.clone(),
+        };
+        match &self.penalty {
+            Some((penalty, weight)) if *weight != 0.0 => aligned + penalty * *weight,
+            _ => aligned,
+        }
+    }
+
     /// The same in 3D for a warp that has the point `origin` of the world as its own: what the warp turns, it turns about that
     /// point. A camera that turns about its centre moves its whole picture; one that turns about what it sees does not.
     pub fn about(
@@ -272,6 +285,18 @@ pub fn codes(warp: &dyn Warp, frame: &Axis) -> Option<Parameter> {
         let shape = Shape::new(&[frame], width);
         Parameter::new(CODE, shape, warp.code_init()).trained(warp.code_trained())
     })
+}
+
+/// What holds the gauge after a step, where codes of zeros are the identity: codes whose first frame stays zero, and the axis of the
+/// frames.
+pub(crate) fn held<'a>(
+    warp: &dyn Warp,
+    settings: &WarpSettings,
+    code: Option<&'a Parameter>,
+    frame: &'a Axis,
+) -> Option<(&'a Tensor, &'a Axis)> {
+    let held = settings.fix_first && warp.zero_code_is_identity();
+    code.filter(|_| held).map(|code| (&code.tensor, frame))
 }
 
 /// The codes as a map sees them. A warp without codes that looks at them all the same carries an error.
