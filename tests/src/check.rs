@@ -19,6 +19,8 @@ pub type Results = Vec<(String, Vec<f64>)>;
 const TOLERANCE: f64 = 1e-4;
 /// ... or this many times what rounding every value of the graph to f32 changes, where a result is a small difference.
 const NOISE: f64 = 60.0;
+/// ... in the worst of so many draws.
+const DRAWS: u64 = 4;
 
 /// Every result of a step in the f64 reference.
 pub fn expected(step: &Step, bindings: &Bindings) -> Results {
@@ -28,9 +30,9 @@ pub fn expected(step: &Step, bindings: &Bindings) -> Results {
 
 /// The same with every node's value rounded to one of its two neighbours, at random: rounding to the nearest keeps symmetries,
 /// and with them exact cancellations, which another order of operations does not keep.
-fn rounded(step: &Step, bindings: &Bindings, neighbours: fn(f64) -> [f64; 2]) -> Results {
+fn rounded(step: &Step, bindings: &Bindings, neighbours: fn(f64) -> [f64; 2], seed: u64) -> Results {
     let roots = step.roots();
-    let mut rng = Rng(1);
+    let mut rng = Rng(seed);
     let mut neighbour = |x: f64| neighbours(x)[usize::from(rng.chance(0.5))];
     let mut values: HashMap<u64, Array> = HashMap::new();
     for t in topological(roots.iter().cloned()) {
@@ -137,9 +139,9 @@ pub fn check(devices: &[Device], step: &Step, bindings: &Bindings) -> Result<(),
     let bindings = round(bindings);
     let reference = expected(step, &bindings);
     let simplified = expected(&simplify(step), &bindings);
-    agree("the simplified graph", &reference, &simplified, 1e-9, || rounded(step, &bindings, double))?;
+    agree("the simplified graph", &reference, &simplified, 1e-9, |seed| rounded(step, &bindings, double, seed))?;
     for target in [Target::cpu(), Target::gpu(), Target { resident: 128, ..Target::gpu() }] {
-        let noise = || rounded(step, &bindings, single);
+        let noise = |seed| rounded(step, &bindings, single, seed);
         agree(
             &format!("the plan for {:?}", target.kind),
             &reference,
@@ -153,7 +155,7 @@ pub fn check(devices: &[Device], step: &Step, bindings: &Bindings) -> Result<(),
         for (at, (before, results)) in found(device, step, &bindings).iter().enumerate() {
             let later = if at > 0 { expected(step, before) } else { vec![] };
             let reference = if at > 0 { &later } else { &reference };
-            let noise = || rounded(step, before, single);
+            let noise = |seed| rounded(step, before, single, seed);
             agree(&format!("{what}, run {}", at + 1), reference, results, TOLERANCE, noise).map_err(|e| {
                 let program = compile(step, &device.target()).map_or_else(|e| e.to_string(), |p| p.to_string());
                 format!("{e}\n{program}")
@@ -177,20 +179,20 @@ pub fn same_bits(a: &Device, b: &Device, step: &Step, bindings: &Bindings) -> Re
     Ok(())
 }
 
-/// Compares results by name; `noise` is what rounding makes of them, asked for only where they differ.
+/// Compares results by name; `noise` is what rounding makes of them, by a seed, asked for only where they differ.
 fn agree(
     what: &str,
     expected: &Results,
     found: &Results,
     tolerance: f64,
-    noise: impl Fn() -> Results,
+    noise: impl Fn(u64) -> Results,
 ) -> Result<(), String> {
     for (at, ((name, expected), (_, found))) in expected.iter().zip(found).enumerate() {
         let error = worst(found, expected, 1e-30);
         if error <= tolerance {
             continue;
         }
-        let rounding = worst(&noise()[at].1, expected, 1e-30);
+        let rounding = (1..=DRAWS).map(|seed| worst(&noise(seed)[at].1, expected, 1e-30)).fold(0.0, f64::max);
         if error <= NOISE * rounding {
             continue;
         }
