@@ -4,7 +4,7 @@ use crate::Error;
 use crate::config::{Sweep, SweepCell};
 use crate::evaluation::{Evaluation, PublishedTable, Table, published_for};
 use crate::run::checkpoint::MANIFEST;
-use crate::run::{Metrics, RunFolder};
+use crate::run::{EVALUATION, Metrics, RunFolder};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -37,7 +37,7 @@ impl SweepCell {
         RunFolder::check(&path, settings)?;
         // Written last of all, with what the run has come to.
         let ended = read::<Metrics>(&path.join("metrics.json")).is_some_and(|m| m.last.is_some());
-        match read::<Evaluation>(&path.join("evaluation.json")) {
+        match read::<Evaluation>(&path.join(EVALUATION)) {
             Some(evaluation) if ended => Ok(Progress::Done(Box::new(evaluation))),
             _ if path.join(MANIFEST).exists() => Ok(Progress::Begun),
             _ => Ok(Progress::Open),

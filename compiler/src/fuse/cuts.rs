@@ -315,6 +315,10 @@ impl Cuts {
             return operand.form != Form::Input && !(weights && self.is_view(&user.operands[i]));
         }
         let gpu = self.target.kind == TargetKind::Gpu;
+        // Of a region's stores a GPU makes several kernels, each of which would compute the value again.
+        if gpu && self.once.contains(&operand.tensor.id()) {
+            return true;
+        }
         let layer = matches!(user.form, Form::Linear { .. }) && user.grain == Grain::Lane;
         if gpu && (layer || user.form == Form::Outer && user.reduces) {
             return true;

@@ -2,7 +2,7 @@
 //!
 //! The gradient of a maximum goes to the elements that equal it. Computed again in another launch, where other ops are fused with
 //! it, an element may be rounded otherwise, equal no longer what it became, and lose its gradient. So the operand of a maximum
-//! that is compared with it is stored where the maximum is taken, and read wherever else it is needed.
+//! that is compared with it is stored and read wherever it is needed; on a CPU a tile that stores it takes the maximum, too.
 
 use super::cuts::resolve;
 use crate::graph::{Tensor, topological};

@@ -63,6 +63,21 @@ pub enum PerturbationError {
     TooLarge { patch: usize, height: usize, width: usize },
 }
 
+impl File {
+    fn read(path: &Path) -> Result<File, PerturbationError> {
+        let format = |message: String| PerturbationError::Format { path: path.into(), message };
+        let text =
+            std::fs::read_to_string(path).map_err(|source| PerturbationError::Read { path: path.into(), source })?;
+        let mut json = serde_json::Deserializer::from_str(&text);
+        let file = serde_path_to_error::deserialize(&mut json).map_err(|e| match e.path().to_string() {
+            field if field == "." => format(e.inner().to_string()),
+            field => format(format!("`{field}`: {}", e.inner())),
+        })?;
+        json.end().map_err(|e| format(e.to_string()))?;
+        Ok(file)
+    }
+}
+
 impl Perturbation {
     /// Draws the perturbation of the settings' noise and seed, or loads the file that they name.
     pub fn of(settings: &Settings, grid: &Grid) -> Result<Perturbation, PerturbationError> {
@@ -100,14 +115,7 @@ impl Perturbation {
 
     fn load(path: &Path, settings: &Settings, grid: &Grid) -> Result<Perturbation, PerturbationError> {
         let format = |message: String| PerturbationError::Format { path: path.into(), message };
-        let text =
-            std::fs::read_to_string(path).map_err(|source| PerturbationError::Read { path: path.into(), source })?;
-        let mut json = serde_json::Deserializer::from_str(&text);
-        let file: File = serde_path_to_error::deserialize(&mut json).map_err(|e| match e.path().to_string() {
-            field if field == "." => format(e.inner().to_string()),
-            field => format(format!("`{field}`: {}", e.inner())),
-        })?;
-        json.end().map_err(|e| format(e.to_string()))?;
+        let file = File::read(path)?;
         let size = |s: [usize; 2]| format!("{} x {}", s[0], s[1]);
         let sets = |key: &str, s: [usize; 2]| format!("; `--set {key}=[{},{}]` would fit", s[0], s[1]);
         let mismatch = |what, found: String, expected: String, hint: String| {
@@ -145,10 +153,16 @@ impl Perturbation {
         Ok(p)
     }
 
-    /// The perturbation in a file of [`Perturbation::to_json`], and the digest of the photo; nothing if it cannot be read.
-    pub fn kept(path: &Path) -> Option<(Perturbation, Option<String>)> {
-        let file: File = serde_json::from_str(&std::fs::read_to_string(path).ok()?).ok()?;
-        Some((file.perturbation, file.photo_blake3))
+    /// The perturbation in a file of [`Perturbation::to_json`], and the digest of the photo if it is known; nothing where no such file
+    /// is.
+    pub fn kept(path: &Path) -> Result<Option<(Perturbation, Option<String>)>, PerturbationError> {
+        let file = match File::read(path) {
+            Err(PerturbationError::Read { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {
+                return Ok(None);
+            }
+            file => file?,
+        };
+        Ok(Some((file.perturbation, file.photo_blake3)))
     }
 
     /// Whether all numbers are the same but for what writing them takes.

@@ -55,7 +55,7 @@ impl PlanarData {
     /// Refuses a photo or a perturbation that the run in a folder did not begin with: a file has changed, or is another one.
     pub fn check_run(&self, folder: &Path, settings: &Settings) -> Result<(), DataError> {
         let path = folder.join(PERTURBATION);
-        let Some((perturbation, photo)) = Perturbation::kept(&path) else { return Ok(()) };
+        let Some((perturbation, photo)) = Perturbation::kept(&path)? else { return Ok(()) };
         let changed = if !self.perturbation.is_near(&perturbation) {
             ("perturbations", &settings.data.perturbation)
         } else if photo.is_some_and(|photo| photo != self.photo.digest()) {

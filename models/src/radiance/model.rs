@@ -79,9 +79,12 @@ pub struct RadianceModel {
     scales_loss: bool,
 }
 
-/// A 3D experiment without its sections.
+/// Settings of the plane where those of space are due.
 #[derive(Debug, thiserror::Error)]
-#[error("these settings are not of a 3D experiment: they have no sections `scene`, `train` and `radiance`")]
+#[error(
+    "this experiment is one of the plane, without cameras, views and surfaces: its settings have no sections `scene`, `train` and \
+     `radiance`"
+)]
 pub struct NotInSpace;
 
 /// The sections of a 3D experiment.

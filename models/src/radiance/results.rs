@@ -9,9 +9,9 @@ use crate::evaluation::{CameraLayout, CameraPanel, DepthStyle, Evaluation, Metri
 use crate::geometry::Pose;
 use crate::pictures::{self, Canvas};
 use crate::report::{Picture, Report};
-use crate::run::RunFolder;
 use crate::run::metrics::{Final, Metrics};
 use crate::run::results::{FRAMES, animation};
+use crate::run::{EVALUATION, RunFolder};
 use crate::scene::{Layout, View, stand_around};
 use crate::training::{Training, Watch};
 
@@ -70,7 +70,7 @@ pub fn write_evaluation(folder: &RunFolder, explorer: &mut Explorer, watch: Watc
     write_poses(folder, &explorer.data, &found)?;
     let cameras = cameras(&explorer.data, &found)?;
     folder.write("cameras.svg", cameras.as_bytes())?;
-    folder.write("evaluation.json", found.evaluation.to_json().as_bytes())?;
+    folder.write(EVALUATION, found.evaluation.to_json().as_bytes())?;
     Ok(Written { evaluation: found.evaluation, views, cameras })
 }
 

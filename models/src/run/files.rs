@@ -24,20 +24,41 @@ pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
     place(path, bytes, |file| file.persist(path).map(drop))
 }
 
-/// Refuses a path that nothing can be written to, before there is anything to write: one in no folder, or a folder.
+/// Refuses a path that nothing can be written to, before there is anything to write: one in no folder or in one without the right
+/// to write, or a folder.
 pub fn can_be_written(path: &Path) -> Result<(), WriteError> {
-    let refuse = |kind: std::io::ErrorKind| Err(WriteError { path: path.to_path_buf(), source: kind.into() });
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    match path.is_dir() {
-        true => refuse(std::io::ErrorKind::IsADirectory),
-        false if !folder.is_dir() => refuse(std::io::ErrorKind::NotFound),
-        false => Ok(()),
+    let refuse = |source| Err(WriteError { path: path.to_path_buf(), source });
+    match path.metadata() {
+        Ok(found) if found.is_dir() => refuse(std::io::ErrorKind::IsADirectory.into()),
+        Ok(found) if !found.is_file() => Ok(()),
+        _ => NamedTempFile::with_prefix_in(TEMPORARY, folder_of(path)).map(drop).or_else(refuse),
     }
+}
+
+fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 /// The same for a file that must not be there yet: of two that write one at a time, one gets an error.
 pub fn write_new(path: &Path, bytes: &[u8]) -> Result<(), WriteError> {
     place(path, bytes, |file| file.persist_noclobber(path).map(drop))
+}
+
+/// How temporary files are called, at first.
+const TEMPORARY: &str = ".raygrad-";
+/// Seconds after which nobody writes a temporary file any more.
+const ABANDONED: u64 = 3600;
+
+/// Removes the temporary files that killed processes left in a folder. One that will not go away does no harm.
+pub fn tidy(folder: &Path) {
+    let abandoned = |entry: &std::fs::DirEntry| {
+        let written = entry.metadata().and_then(|m| m.modified());
+        let age = written.ok().and_then(|time| time.elapsed().ok()).unwrap_or_default();
+        entry.file_name().to_string_lossy().starts_with(TEMPORARY) && age.as_secs() >= ABANDONED
+    };
+    for entry in std::fs::read_dir(folder).into_iter().flatten().flatten().filter(abandoned) {
+        let _ = std::fs::remove_file(entry.path());
+    }
 }
 
 fn place(
@@ -46,8 +67,8 @@ fn place(
     persist: impl FnOnce(NamedTempFile) -> Result<(), tempfile::PersistError>,
 ) -> Result<(), WriteError> {
     let refuse = |source| WriteError { path: path.to_path_buf(), source };
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let file = NamedTempFile::with_prefix_in(".raygrad-", folder).map_err(refuse)?;
+    let folder = folder_of(path);
+    let file = NamedTempFile::with_prefix_in(TEMPORARY, folder).map_err(refuse)?;
     let mut plain = file.as_file();
     plain.write_all(bytes).and_then(|()| plain.sync_all()).map_err(refuse)?;
     make_readable(file.as_file()).map_err(refuse)?;
@@ -92,6 +113,22 @@ mod tests {
         std::fs::remove_file(dir.path().join("b.txt")).unwrap();
         assert!(write_atomically(&path.join("below"), b"x").unwrap_err().to_string().contains("a.txt"));
         assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn what_killed_processes_left_is_removed() {
+        let dir = tempfile::tempdir().unwrap();
+        let make = |name: &str, seconds: u64| {
+            let file = std::fs::File::create(dir.path().join(name)).unwrap();
+            file.set_modified(std::time::SystemTime::now() - std::time::Duration::from_secs(seconds)).unwrap();
+        };
+        make(".raygrad-old", ABANDONED + 60);
+        make(".raygrad-new", 60);
+        make("raygrad-own", ABANDONED + 60);
+        tidy(dir.path());
+        let mut left: Vec<_> = std::fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().file_name()).collect();
+        left.sort();
+        assert_eq!(left, [".raygrad-new", "raygrad-own"]);
     }
 
     #[cfg(unix)]

@@ -1,13 +1,15 @@
 //! The run folder: which run it holds, and that nothing of another run is overwritten.
 
 use super::checkpoint::MANIFEST;
-use super::files::{WriteError, write_atomically, write_new};
+use super::files::{WriteError, tidy, write_atomically, write_new};
 use super::lock::{LOCK, RunLock};
 use crate::config::{ConfigError, Count, DeviceChoice, Layered, Networks, Settings};
 use std::path::{Path, PathBuf};
 
 /// Name of the resolved settings, which mark a folder as a run's.
 pub const CONFIG: &str = "config.toml";
+/// Name of what was measured of a run.
+pub const EVALUATION: &str = "evaluation.json";
 
 /// Why a folder cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -96,7 +98,9 @@ impl RunFolder {
     /// Opens the folder of the same run again, to train on in it.
     pub fn reopen(path: &Path, settings: &Settings) -> Result<RunFolder, FolderError> {
         RunFolder::check(path, settings)?;
-        Ok(RunFolder::at(path, true, Some(RunLock::take(path)?)))
+        let lock = RunLock::take(path)?;
+        tidy(path);
+        Ok(RunFolder::at(path, true, Some(lock)))
     }
 
     /// Refuses a folder that does not hold this run.

@@ -8,5 +8,5 @@ pub mod metrics;
 pub mod results;
 
 pub use checkpoint::{Checkpoint, CheckpointError};
-pub use folder::{FolderError, RunFolder};
+pub use folder::{EVALUATION, FolderError, RunFolder};
 pub use metrics::{Entry, Final, Measured, Metrics, Relocalised};

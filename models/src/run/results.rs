@@ -1,8 +1,8 @@
 //! The files of a planar run: data, animation frames, pictures and report.
 
-use super::RunFolder;
 use super::folder::CONFIG;
 use super::metrics::Metrics;
+use super::{EVALUATION, RunFolder};
 use crate::Error;
 use crate::config::{Layered, Settings};
 use crate::evaluation::{self, Measured, Scores, ViewScores, success_px};
@@ -52,7 +52,7 @@ pub fn write_evaluation(
     cameras.mean.success = cameras.mean.corner_error_px.map(|e| if e < below { 1.0 } else { 0.0 });
     let (scene, method) = (settings.scene_name(), settings.method_name().to_string());
     let evaluation = evaluation::Evaluation { scene, method, cameras, ..evaluation::Evaluation::default() };
-    folder.write("evaluation.json", evaluation.to_json().as_bytes())?;
+    folder.write(EVALUATION, evaluation.to_json().as_bytes())?;
     Ok(evaluation)
 }
 

@@ -210,7 +210,7 @@ fn a_planar_run_is_measured_by_its_corners() {
     }
     mentions(&w.succeed(&["eval", "run"]), &["corner error (px)", "patch PSNR", "success", "patches (px)"]);
     for command in [&["export", "run", "--out", "x"][..], &["video", "run"], &["eval", "run", "--mesh", "m.ply"]] {
-        mentions(&w.refuse(command), &["not of a 3D experiment"]);
+        mentions(&w.refuse(command), &["one of the plane, without cameras"]);
     }
     mentions(&w.refuse(&["eval", "run", "--fit-grid", "3"]), &["in the plane"]);
     mentions(&w.refuse(&["eval", "run", "--data", "x"]), &["in the plane", "`--image`"]);

@@ -7,8 +7,8 @@ use crate::surface::{Surface, SurfaceArgs};
 use clap::Args;
 use raygrad::Error;
 use raygrad::evaluation::{Evaluation, Measured, Metric, PublishedTable, Table, published_for};
-use raygrad::run::RunFolder;
 use raygrad::run::files::{can_be_written, write_atomically};
+use raygrad::run::{EVALUATION, RunFolder};
 use raygrad::scene::Layout;
 use raygrad::training::{Training, Watch};
 use serde::Serialize;
@@ -59,8 +59,10 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         can_be_written(path).map_err(Error::from)?;
     }
     let folder = RunFolder::open(&args.held.run).map_err(Error::from)?;
+    let written = folder.path().join(EVALUATION);
+    can_be_written(&written).map_err(Error::from)?;
     let settings = experiment.layered.settings.clone();
-    let earlier = std::fs::read_to_string(folder.path().join("evaluation.json")).unwrap_or_default();
+    let earlier = std::fs::read_to_string(written).unwrap_or_default();
     let had = |metric: Metric| earlier.contains(&format!("\"{}\"", metric.key()));
     // Ctrl-C ends this command at once: what it writes is written as whole files.
     let never = AtomicBool::new(false);
@@ -72,7 +74,7 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
             return Ok(evaluation);
         }
         let named = Evaluation { scene, ..evaluation };
-        folder.write("evaluation.json", named.to_json().as_bytes())?;
+        folder.write(EVALUATION, named.to_json().as_bytes())?;
         Ok(named)
     };
     let (mut evaluation, step, surface, layout);
@@ -85,7 +87,7 @@ pub fn run(args: &EvalArgs) -> anyhow::Result<ExitCode> {
         surface = args.surface.wanted().then(|| args.surface.run(&mut explorer, &checked)).transpose();
         if let Some(distances) = surface.as_ref().ok().and_then(|s| s.as_ref()?.chamfer.as_ref()) {
             evaluation.cameras.mean.chamfer = Some(distances.mean);
-            folder.write("evaluation.json", evaluation.to_json().as_bytes()).map_err(Error::from)?;
+            folder.write(EVALUATION, evaluation.to_json().as_bytes()).map_err(Error::from)?;
         }
     } else {
         let mut trainer = experiment.restored()?;
