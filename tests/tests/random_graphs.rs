@@ -12,6 +12,7 @@ use raygrad_runtime::Device;
 use raygrad_tests::backend::{devices_for_large_programs, nightly, vulkan, wgpu};
 use raygrad_tests::check::{check, same_bits};
 use raygrad_tests::graphs::{Recipe, shrink};
+use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Mutex;
 
@@ -30,16 +31,20 @@ const MOST: usize = 128;
 /// Those that also run through Vulkan: the kernels are the same as through wgpu.
 const THROUGH_VULKAN: u64 = 100;
 
-/// Every other seed of the graphs to check, so that halves run side by side.
-fn seeds(count: u64, half: u64) -> impl Iterator<Item = u64> {
-    let range = match std::env::var("RAYGRAD_GRAPHS") {
+/// Seeds of the graphs to check.
+fn seeds(count: u64) -> Range<u64> {
+    match std::env::var("RAYGRAD_GRAPHS") {
         Ok(text) => {
             let (first, end) = text.split_once("..").expect("RAYGRAD_GRAPHS is first..end");
             first.parse().expect("a number")..end.parse().expect("a number")
         }
         Err(_) => 0..count,
-    };
-    range.filter(move |s| s % 2 == half)
+    }
+}
+
+/// Every other one of them, so that halves run side by side.
+fn half(count: u64, half: u64) -> impl Iterator<Item = u64> {
+    seeds(count).filter(move |s| s % 2 == half)
 }
 
 /// What is wrong with a recipe's graph, panics included.
@@ -103,22 +108,22 @@ fn reductions_inside_tiles_occur_often() {
 
 #[test]
 fn first_half() {
-    check_graphs(&devices_for_large_programs(), Recipe::new, seeds(large(), 0));
+    check_graphs(&devices_for_large_programs(), Recipe::new, half(large(), 0));
 }
 
 #[test]
 fn second_half() {
-    check_graphs(&devices_for_large_programs(), Recipe::new, seeds(large(), 1));
+    check_graphs(&devices_for_large_programs(), Recipe::new, half(large(), 1));
 }
 
 #[test]
 fn small_graphs_first_half() {
-    check_graphs(&without_vulkan(), Recipe::small, seeds(SMALL, 0));
+    check_graphs(&without_vulkan(), Recipe::small, half(SMALL, 0));
 }
 
 #[test]
 fn small_graphs_second_half() {
-    check_graphs(&without_vulkan(), Recipe::small, seeds(SMALL, 1));
+    check_graphs(&without_vulkan(), Recipe::small, half(SMALL, 1));
 }
 
 fn without_vulkan() -> Vec<Device> {
@@ -129,7 +134,7 @@ fn without_vulkan() -> Vec<Device> {
 #[test]
 fn small_graphs_through_vulkan() {
     let devices: Vec<Device> = vulkan().into_iter().collect();
-    check_graphs(&devices, Recipe::small, seeds(THROUGH_VULKAN, 0).chain(seeds(THROUGH_VULKAN, 1)));
+    check_graphs(&devices, Recipe::small, seeds(THROUGH_VULKAN));
 }
 
 /// Networks that stay in a workgroup, of the graphs that have some.
@@ -147,8 +152,10 @@ fn networks_in_workgroups() {
         (Recipe::small as fn(u64) -> Recipe, if nightly() { SMALL } else { 200 }),
         (Recipe::new, if nightly() { 600 } else { 20 }),
     ] {
-        let found: Vec<u64> = (0..count).filter(|s| has_some(recipe, *s)).collect();
-        assert!(found.len() as u64 >= count / 20, "{} of {count} graphs", found.len());
+        let all = seeds(count);
+        let least = (all.end - all.start) / 20;
+        let found: Vec<u64> = all.filter(|s| has_some(recipe, *s)).collect();
+        assert!(found.len() as u64 >= least, "{} of {:?} graphs", found.len(), seeds(count));
         check_graphs(&devices, recipe, found.into_iter());
     }
 }
