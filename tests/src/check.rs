@@ -15,12 +15,24 @@ use std::collections::HashMap;
 /// A named result: an output, or an input after its update.
 pub type Results = Vec<(String, Vec<f64>)>;
 
-/// How far a device may be off, relative to the largest value of a tensor.
-const TOLERANCE: f64 = 1e-4;
-/// ... or this many times what rounding every value of the graph to f32 changes, where a result is a small difference.
-const NOISE: f64 = 60.0;
-/// ... in the worst of so many draws.
+/// How far results may be off.
+#[derive(Clone, Copy)]
+struct Allowed {
+    /// Relative to the largest value of a tensor ...
+    relative: f64,
+    /// ... or this many times what rounding every value of the graph changes, where a result is a small difference; in the worst of
+    /// [`DRAWS`].
+    noise: f64,
+    /// The numbers that a value is rounded to.
+    neighbours: fn(f64) -> [f64; 2],
+}
+
 const DRAWS: u64 = 4;
+const SIMPLIFIED: Allowed = Allowed { relative: 1e-9, noise: 60.0, neighbours: double };
+const PLANNED: Allowed = Allowed { relative: 1e-5, noise: 60.0, neighbours: single };
+const SINGLE: Allowed = Allowed { relative: 1e-4, noise: 60.0, neighbours: single };
+/// Of devices that round what they multiply in layers.
+const MIXED: Allowed = Allowed { relative: 3e-2, noise: 8.0, neighbours: half };
 
 /// Every result of a step in the f64 reference.
 pub fn expected(step: &Step, bindings: &Bindings) -> Results {
@@ -57,6 +69,13 @@ fn single(x: f64) -> [f64; 2] {
         _ => nearest.next_up(),
     };
     [other, nearest].map(f64::from)
+}
+
+/// The values of bfloat16 around one of double precision.
+fn half(x: f64) -> [f64; 2] {
+    let below = f32::from_bits((x as f32).to_bits() & 0xffff_0000);
+    let above = f32::from_bits(below.to_bits().wrapping_add(0x1_0000));
+    [below, if above.is_finite() { above } else { below }].map(f64::from)
 }
 
 /// What rounding in double precision may make of a value.
@@ -138,29 +157,27 @@ fn planned(step: &Step, bindings: &Bindings, target: &Target) -> Result<Results,
 pub fn check(devices: &[Device], step: &Step, bindings: &Bindings) -> Result<(), String> {
     let bindings = round(bindings);
     let reference = expected(step, &bindings);
-    let simplified = expected(&simplify(step), &bindings);
-    agree("the simplified graph", &reference, &simplified, 1e-9, |seed| rounded(step, &bindings, double, seed))?;
+    let agrees = |what: &str, allowed, found: &Results| agree(what, step, &bindings, &reference, found, allowed);
+    agrees("the simplified graph", SIMPLIFIED, &expected(&simplify(step), &bindings))?;
     for target in [Target::cpu(), Target::gpu(), Target { resident: 128, ..Target::gpu() }] {
-        let noise = |seed| rounded(step, &bindings, single, seed);
-        agree(
-            &format!("the plan for {:?}", target.kind),
-            &reference,
-            &planned(step, &bindings, &target)?,
-            1e-5,
-            noise,
-        )?;
+        agrees(&format!("the plan for {:?}", target.kind), PLANNED, &planned(step, &bindings, &target)?)?;
     }
-    for device in devices {
-        let what = format!("{:?}", device.target().kind);
-        for (at, (before, results)) in found(device, step, &bindings).iter().enumerate() {
-            let later = if at > 0 { expected(step, before) } else { vec![] };
-            let reference = if at > 0 { &later } else { &reference };
-            let noise = |seed| rounded(step, before, single, seed);
-            agree(&format!("{what}, run {}", at + 1), reference, results, TOLERANCE, noise).map_err(|e| {
-                let program = compile(step, &device.target()).map_or_else(|e| e.to_string(), |p| p.to_string());
-                format!("{e}\n{program}")
-            })?;
-        }
+    devices.iter().try_for_each(|device| two_runs(device, step, &bindings, SINGLE))
+}
+
+/// That a device of mixed precision gives the values of a step, but for its rounding.
+pub fn check_mixed(device: &Device, step: &Step, bindings: &Bindings) -> Result<(), String> {
+    two_runs(device, step, &round(bindings), MIXED)
+}
+
+/// Compares two runs of a step on a device with the reference.
+fn two_runs(device: &Device, step: &Step, bindings: &Bindings, allowed: Allowed) -> Result<(), String> {
+    for (at, (before, results)) in found(device, step, bindings).iter().enumerate() {
+        let what = format!("{:?}, run {}", device.target().kind, at + 1);
+        agree(&what, step, before, &expected(step, before), results, allowed).map_err(|e| {
+            let program = compile(step, &device.target()).map_or_else(|e| e.to_string(), |p| p.to_string());
+            format!("{e}\n{program}")
+        })?;
     }
     Ok(())
 }
@@ -179,26 +196,28 @@ pub fn same_bits(a: &Device, b: &Device, step: &Step, bindings: &Bindings) -> Re
     Ok(())
 }
 
-/// Compares results by name; `noise` is what rounding makes of them, by a seed, asked for only where they differ.
+/// Compares results by name. What rounding makes of them is computed only where they differ.
 fn agree(
     what: &str,
+    step: &Step,
+    bindings: &Bindings,
     expected: &Results,
     found: &Results,
-    tolerance: f64,
-    noise: impl Fn(u64) -> Results,
+    allowed: Allowed,
 ) -> Result<(), String> {
     for (at, ((name, expected), (_, found))) in expected.iter().zip(found).enumerate() {
         let error = worst(found, expected, 1e-30);
-        if error <= tolerance {
+        if error <= allowed.relative {
             continue;
         }
-        let rounding = (1..=DRAWS).map(|seed| worst(&noise(seed)[at].1, expected, 1e-30)).fold(0.0, f64::max);
-        if error <= NOISE * rounding {
+        let noise = |seed| worst(&rounded(step, bindings, allowed.neighbours, seed)[at].1, expected, 1e-30);
+        let rounding = (1..=DRAWS).map(noise).fold(0.0, f64::max);
+        if error <= allowed.noise * rounding {
             continue;
         }
         let far = |i: &usize| {
             let scale = expected.iter().fold(1e-30f64, |m, x| m.max(x.abs()));
-            ((found[*i] - expected[*i]).abs() / scale).partial_cmp(&tolerance) != Some(std::cmp::Ordering::Less)
+            ((found[*i] - expected[*i]).abs() / scale).partial_cmp(&allowed.relative) != Some(std::cmp::Ordering::Less)
         };
         let lanes: Vec<usize> = (0..expected.len()).filter(far).collect();
         let first: Vec<_> = lanes.iter().take(6).map(|i| (*i, found[*i], expected[*i])).collect();

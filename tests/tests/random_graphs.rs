@@ -8,9 +8,9 @@ use raygrad_compiler::plan::region::RegionOp;
 #[cfg(feature = "gpu")]
 use raygrad_compiler::plan::region::{Grain, Region};
 use raygrad_compiler::{Program, StepError, Target, compile};
-use raygrad_runtime::Device;
+use raygrad_runtime::{Device, Precision};
 use raygrad_tests::backend::{devices_for_large_programs, nightly, vulkan, wgpu};
-use raygrad_tests::check::{check, same_bits};
+use raygrad_tests::check::{check, check_mixed, same_bits};
 use raygrad_tests::graphs::{Recipe, shrink};
 use std::ops::Range;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -124,6 +124,18 @@ fn small_graphs_first_half() {
 #[test]
 fn small_graphs_second_half() {
     check_graphs(&without_vulkan(), Recipe::small, half(SMALL, 1));
+}
+
+/// Products of pairs of bfloat16 on the CPU: what is off by more than their rounding.
+#[test]
+fn mixed_products() {
+    let mixed = Device::cpu(Some(2)).and_then(|d| d.with_precision(Precision::Mixed)).unwrap_or_else(|e| panic!("{e}"));
+    for seed in seeds(large() / 3) {
+        let graph = Recipe::new(seed).build();
+        if graph.step.check().is_ok() {
+            check_mixed(&mixed, &graph.step, &graph.bindings).unwrap_or_else(|e| panic!("{seed}: {e}"));
+        }
+    }
 }
 
 fn without_vulkan() -> Vec<Device> {
