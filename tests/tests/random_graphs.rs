@@ -138,6 +138,20 @@ fn mixed_products() {
     }
 }
 
+/// Halves on a GPU.
+#[test]
+fn small_graphs_in_halves() {
+    if let Some(gpu) = vulkan() {
+        let mixed = gpu.with_precision(Precision::Mixed).unwrap_or_else(|e| panic!("{e}"));
+        for seed in seeds(THROUGH_VULKAN) {
+            let graph = Recipe::small(seed).build();
+            if graph.step.check().is_ok() {
+                check_mixed(&mixed, &graph.step, &graph.bindings).unwrap_or_else(|e| panic!("{seed}: {e}"));
+            }
+        }
+    }
+}
+
 fn without_vulkan() -> Vec<Device> {
     let cpu = Device::cpu(Some(2)).expect("starts threads");
     std::iter::once(cpu).chain(wgpu()).collect()
