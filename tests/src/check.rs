@@ -3,6 +3,7 @@
 
 use crate::backend::{load, round};
 use crate::{Rng, worst};
+use raygrad_compiler::fuse::TargetKind;
 use raygrad_compiler::graph::{Tensor, topological};
 use raygrad_compiler::plan::{Buffer, BufferKind};
 use raygrad_compiler::reference::{Array, Bindings, Data, evaluate};
@@ -31,8 +32,9 @@ const DRAWS: u64 = 4;
 const SIMPLIFIED: Allowed = Allowed { relative: 1e-9, noise: 60.0, neighbours: double };
 const PLANNED: Allowed = Allowed { relative: 1e-5, noise: 60.0, neighbours: single };
 const SINGLE: Allowed = Allowed { relative: 1e-4, noise: 60.0, neighbours: single };
-/// Of devices that round what they multiply in layers.
-const MIXED: Allowed = Allowed { relative: 3e-2, noise: 8.0, neighbours: half };
+/// Of devices that round what they multiply in layers, CPUs and GPUs.
+const PAIRS: Allowed = Allowed { relative: 3e-2, noise: 8.0, neighbours: bf16 };
+const HALVES: Allowed = Allowed { relative: 1e-2, noise: 8.0, neighbours: f16 };
 
 /// Every result of a step in the f64 reference.
 pub fn expected(step: &Step, bindings: &Bindings) -> Results {
@@ -72,10 +74,21 @@ fn single(x: f64) -> [f64; 2] {
 }
 
 /// The values of bfloat16 around one of double precision.
-fn half(x: f64) -> [f64; 2] {
-    let below = f32::from_bits((x as f32).to_bits() & 0xffff_0000);
-    let above = f32::from_bits(below.to_bits().wrapping_add(0x1_0000));
-    [below, if above.is_finite() { above } else { below }].map(f64::from)
+fn bf16(x: f64) -> [f64; 2] {
+    of_bits(x, 7, -126)
+}
+
+/// Those of f16, of which the smallest is 2^-24.
+fn f16(x: f64) -> [f64; 2] {
+    of_bits(x, 10, -14)
+}
+
+/// Those with so many bits after the first, and this least exponent.
+fn of_bits(x: f64, bits: i32, least: i32) -> [f64; 2] {
+    let exponent = x.abs().max(f64::MIN_POSITIVE).log2().floor() as i32;
+    let step = 2f64.powi(exponent.max(least) - bits);
+    let below = (x / step).floor() * step;
+    [below, if below == x { x } else { below + step }]
 }
 
 /// What rounding in double precision may make of a value.
@@ -167,7 +180,8 @@ pub fn check(devices: &[Device], step: &Step, bindings: &Bindings) -> Result<(),
 
 /// That a device of mixed precision gives the values of a step, but for its rounding.
 pub fn check_mixed(device: &Device, step: &Step, bindings: &Bindings) -> Result<(), String> {
-    two_runs(device, step, &round(bindings), MIXED)
+    let allowed = if device.target().kind == TargetKind::Cpu { PAIRS } else { HALVES };
+    two_runs(device, step, &round(bindings), allowed)
 }
 
 /// Compares two runs of a step on a device with the reference.
