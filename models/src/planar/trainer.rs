@@ -3,7 +3,7 @@
 use super::data::PlanarData;
 use super::model::{self, PlanarModel};
 use crate::Error;
-use crate::config::{Count, Layered, Settings};
+use crate::config::{Count, Layered, Method, Settings};
 use crate::estimate::{Trial, timed};
 use crate::evaluation;
 use crate::geometry::Transform;
@@ -29,6 +29,7 @@ pub struct Trainer {
     frame: (View, ProgramId),
     full: (View, ProgramId),
     flops: f64,
+    notes: Vec<String>,
 }
 
 /// The model over all pixels of all patches.
@@ -56,8 +57,8 @@ impl Trainer {
         learner.fill(&model.parameters(), settings.run.seed)?;
         learner.set_seed(model::SEED, settings.run.seed)?;
         let (frame, full, flops) = ((frame_view, frame), (full_view, full), model.flops());
-        let settings = settings.clone();
-        let mut trainer = Trainer { data, settings, learner, train, evaluate, frame, full, flops };
+        let (settings, notes) = (settings.clone(), notes(settings));
+        let mut trainer = Trainer { data, settings, learner, train, evaluate, frame, full, flops, notes };
         trainer.fill_data()?;
         Ok(trainer)
     }
@@ -118,6 +119,20 @@ impl Trainer {
     }
 }
 
+/// What should be known of the numbers that an experiment ends with.
+fn notes(settings: &Settings) -> Vec<String> {
+    let (pinned, one) = (settings.warp.fix_first, settings.data.patches == 1);
+    let note = match settings.warp.method {
+        Method::None => return vec![],
+        _ if !pinned => {
+            "no patch is pinned (`warp.fix_first`), so that corner errors hold what all patches moved together"
+        }
+        _ if one => "there is one patch, and it is pinned (`warp.fix_first`): nothing is aligned",
+        _ => return vec![],
+    };
+    vec![note.to_string()]
+}
+
 impl Training for Trainer {
     fn learner(&self) -> &Learner {
         &self.learner
@@ -131,6 +146,9 @@ impl Training for Trainer {
     fn measure(&mut self) -> Result<Entry, Error> {
         let (entry, _) = self.read_entry(self.train)?;
         Ok(entry)
+    }
+    fn notes(&self) -> &[String] {
+        &self.notes
     }
     fn flops(&self) -> f64 {
         self.flops
@@ -187,5 +205,23 @@ impl Training for Trainer {
             "corner error  {mean:.3} px  (patches: {})\npatch PSNR    {patch_psnr_db:.2} dB\nsteps         {steps} in {time}{drawn}\n",
             errors.join(", ")
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_makes_numbers_mean_little_is_noted() {
+        let noted = |all: &[&str]| {
+            let mut layered = Layered::load("planar-l2g-small").unwrap();
+            all.iter().for_each(|set| layered.set(set).unwrap());
+            notes(&layered.settings).concat()
+        };
+        assert_eq!(noted(&[]), "");
+        assert!(noted(&["warp.fix_first=false"]).starts_with("no patch is pinned"));
+        assert!(noted(&["data.patches=1"]).ends_with("nothing is aligned"));
+        assert_eq!(noted(&["data.patches=1", "warp.method=none"]), "");
     }
 }
