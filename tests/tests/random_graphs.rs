@@ -21,6 +21,9 @@ fn large() -> u64 {
     if nightly() { 10_000 } else { 1500 }
 }
 
+/// Those of them that a software GPU runs, too, at night.
+const ON_ALL_DEVICES: u64 = 60;
+
 /// Graphs of a run that are small enough for a software GPU, which takes half a second each.
 const SMALL: u64 = 500;
 
@@ -108,12 +111,18 @@ fn reductions_inside_tiles_occur_often() {
 
 #[test]
 fn first_half() {
-    check_graphs(&devices_for_large_programs(), Recipe::new, half(large(), 0));
+    check_graphs(&[cpu()], Recipe::new, half(large(), 0));
 }
 
 #[test]
 fn second_half() {
-    check_graphs(&devices_for_large_programs(), Recipe::new, half(large(), 1));
+    check_graphs(&[cpu()], Recipe::new, half(large(), 1));
+}
+
+/// On every GPU, too, where `RAYGRAD_NIGHTLY=1`.
+#[test]
+fn large_graphs_on_all_devices() {
+    check_graphs(&devices_for_large_programs(), Recipe::new, seeds(ON_ALL_DEVICES));
 }
 
 #[test]
@@ -129,7 +138,7 @@ fn small_graphs_second_half() {
 /// Products of pairs of bfloat16 on the CPU: what is off by more than their rounding.
 #[test]
 fn mixed_products() {
-    let mixed = Device::cpu(Some(2)).and_then(|d| d.with_precision(Precision::Mixed)).unwrap_or_else(|e| panic!("{e}"));
+    let mixed = cpu().with_precision(Precision::Mixed).unwrap_or_else(|e| panic!("{e}"));
     for seed in seeds(large() / 3) {
         let graph = Recipe::new(seed).build();
         if graph.step.check().is_ok() {
@@ -153,8 +162,11 @@ fn small_graphs_in_halves() {
 }
 
 fn without_vulkan() -> Vec<Device> {
-    let cpu = Device::cpu(Some(2)).expect("starts threads");
-    std::iter::once(cpu).chain(wgpu()).collect()
+    std::iter::once(cpu()).chain(wgpu()).collect()
+}
+
+fn cpu() -> Device {
+    Device::cpu(Some(2)).expect("starts threads")
 }
 
 #[test]
