@@ -108,6 +108,15 @@ fn positions_of_extremes_are_the_first_of_equal_ones() {
     let (most, least) = (x.argmax_channels().to_f32(), x.argmin_channels().to_f32());
     let found = everywhere(&[most, least], &bindings, 0.0);
     assert_eq!(found, [[1.0, 2.0, 2.0, 0.0], [0.0, 0.0, 1.0, 2.0]]);
+    let (most, least) = (x.argmax_over(&row).to_f32(), x.argmin_over(&row).to_f32());
+    assert_eq!(everywhere(&[most, least], &bindings, 0.0), [[3.0, 0.0, 1.0], [1.0, 1.0, 3.0]]);
+    let (row, column) = (Axis::new("row", 3), Axis::new("column", 4));
+    let (none, less) = (f64::NAN, f64::NEG_INFINITY);
+    let values = vec![0.5, 2.0, 2.0, 1.0, none, none, none, none, less, none, -1.0, -1.0];
+    let (x, bindings) = bind("x", Shape::new(&[&row, &column], 1), values);
+    let shares = x.argmax_over(&column).equal(&Tensor::index(&column)).to_f32();
+    let found = everywhere(&[x.argmax_over(&column).to_f32(), shares.sum(&[&column])], &bindings, 0.0);
+    assert_eq!(found, [[1.0, 0.0, 2.0], [1.0, 1.0, 1.0]]);
 }
 
 #[test]

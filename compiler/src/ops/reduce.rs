@@ -6,6 +6,9 @@ use crate::graph::{Axes, Axis, Misfit, Shape, Tensor, function};
 use crate::reference::Array;
 use crate::scalar::DType;
 
+/// Positions that single precision can count.
+const MOST_POSITIONS: usize = 1 << 24;
+
 /// Reduction over `over`.
 #[derive(Clone, Debug)]
 pub struct Reduce {
@@ -116,6 +119,27 @@ impl Tensor {
         let _called = function("min_over");
         -(-self).max_over(over)
     }
+    /// The position along `axis` of the largest value as `u32`, of equal ones the first; for every channel. NaN is larger than
+    /// nothing.
+    #[track_caller]
+    pub fn argmax_over(&self, axis: &Axis) -> Tensor {
+        let _called = function("argmax_over");
+        if axis.size() > MOST_POSITIONS {
+            let problem = format!("`{axis}` has more than {MOST_POSITIONS} elements");
+            return Tensor::misfit("argmax_over", &[self], problem, "cut it into shorter ones");
+        }
+        let lowest = Tensor::scalar(f64::from(f32::MIN));
+        let number = self.max(&lowest).equal(self).select(self, &lowest);
+        let largest = number.equal(&number.max_over(&[axis]));
+        let position = largest.select(&Tensor::index(axis).to_f32(), &Tensor::scalar(MOST_POSITIONS as f64));
+        position.min_over(&[axis]).to_u32()
+    }
+    /// The position of the smallest value, likewise.
+    #[track_caller]
+    pub fn argmin_over(&self, axis: &Axis) -> Tensor {
+        let _called = function("argmin_over");
+        (-self).argmax_over(axis)
+    }
     /// The same values with all of `axes`: repeated along those this tensor lacks.
     #[track_caller]
     pub fn broadcast_to(&self, axes: &Axes) -> Tensor {
@@ -148,8 +172,8 @@ impl Op for Broadcast {
 pub fn samples() -> Vec<Sample> {
     let (frame, row) = (Axis::new("frame", 3), Axis::new("row", 4));
     let x = || vec![SampleInput::new(Shape::new(&[&frame, &row], 2), -1.0, 1.0)];
-    let (f, f2, f3) = (frame.clone(), frame.clone(), frame.clone());
-    let (r, r2, r3) = (row.clone(), row.clone(), row.clone());
+    let (f, f2, f3, f4) = (frame.clone(), frame.clone(), frame.clone(), frame.clone());
+    let (r, r2, r3, r4) = (row.clone(), row.clone(), row.clone(), row.clone());
     vec![
         Sample::new("sum over the inner axis", x(), move |x| x[0].sum(&[&r])),
         Sample::new("sum over the outer axis", x(), move |x| x[0].sum(&[&f])),
@@ -157,6 +181,8 @@ pub fn samples() -> Vec<Sample> {
         Sample::new("mean_all", x(), |x| x[0].mean_all()),
         Sample::new("max_over", x(), move |x| x[0].max_over(&[&r3])),
         Sample::new("min_over", x(), move |x| x[0].min_over(&[&f3])),
+        Sample::new("argmax_over", x(), move |x| x[0].argmax_over(&r4).to_f32()).not_differentiable(),
+        Sample::new("argmin_over", x(), move |x| x[0].argmin_over(&f4).to_f32()).not_differentiable(),
         Sample::new("broadcast", vec![SampleInput::new(Shape::new(&[&frame], 2), -1.0, 1.0)], move |x| {
             x[0].broadcast_to(&Axes::new([frame.clone(), row.clone()]))
         }),
