@@ -9,13 +9,22 @@
 //! steps = 1000
 //! [preset.barf-small.optim]               # for one, by the name of the preset or of its file without the ending
 //! lr = 1e-3
+//!
+//! [clouds]                                # surfaces to measure distances from, by scene
+//! scan24 = "stl024_total.ply"
+//! [mesh]                                  # how surfaces are found, as by the options of `raygrad eval`; all may be left out
+//! resolution = 128
+//! threshold = 25.0
+//! bounds = [-1.2, 1.2]
 //! ```
 
 use super::error::{ConfigError, Origin};
 use super::layers::{Layered, When, nearest, unknown};
 use super::leaves::{Leaf, leaves};
+use crate::evaluation::MeshOptions;
 use crate::scene::Layout;
-use std::path::Path;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 use toml::Value;
 
 /// All runs of a sweep, by scene, then preset, then seed.
@@ -24,6 +33,10 @@ pub struct Sweep {
     /// Stem of the file.
     pub name: String,
     pub cells: Vec<SweepCell>,
+    /// Of some scenes, by name, the mesh or cloud that found surfaces are compared with.
+    pub clouds: BTreeMap<String, PathBuf>,
+    /// How these surfaces are found.
+    pub mesh: MeshOptions,
 }
 
 /// One run.
@@ -36,6 +49,9 @@ pub struct SweepCell {
 }
 
 const LISTS: [&str; 3] = ["presets", "scenes", "seeds"];
+const CLOUDS: &str = "clouds.";
+const MESH: &str = "mesh.";
+const OPTIONS: [&str; 3] = ["mesh.resolution", "mesh.threshold", "mesh.bounds"];
 
 impl Sweep {
     /// Reads a file and checks everything that can be checked before a run: keys, values, presets, and that scenes and photos
@@ -46,8 +62,11 @@ impl Sweep {
     pub fn load(path: &Path) -> Result<Sweep, ConfigError> {
         let text = std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.into(), source })?;
         let file = path.to_string_lossy();
-        let (lists, mut rest): (Vec<Leaf>, Vec<Leaf>) =
+        let (lists, rest): (Vec<Leaf>, Vec<Leaf>) =
             leaves(&file, &text)?.into_iter().partition(|l| LISTS.contains(&l.key.as_str()));
+        let (clouds, rest): (Vec<Leaf>, Vec<Leaf>) = rest.into_iter().partition(|l| l.key.starts_with(CLOUDS));
+        let (mesh, mut rest): (Vec<Leaf>, Vec<Leaf>) = rest.into_iter().partition(|l| l.key.starts_with(MESH));
+        let mesh = mesh.iter().try_fold(MeshOptions::default(), with_option)?;
         let list = |key: &str| lists.iter().find(|l| l.key == key);
         let Some(presets) = list("presets") else {
             return Err(ConfigError::MissingOfSweep { file: file.into() });
@@ -82,17 +101,33 @@ impl Sweep {
             }
         }
         let scenes: Vec<String> = cells.iter().map(|c| c.layered.settings.scene_name()).collect();
+        let known = |leaf: &Leaf, scene: &String| {
+            if scenes.contains(scene) {
+                return Ok(());
+            }
+            let meant = nearest(scene, scenes.iter().map(String::as_str));
+            let meant = meant.map_or(String::new(), |n| format!("; did you mean `{n}`?"));
+            Err(refuse(leaf, format!("no scene of this sweep is called `{scene}`{meant}")))
+        };
         for leaf in &rest {
-            if let When::On(scene) = when(leaf)
-                && !scenes.contains(&scene)
-            {
-                let meant = nearest(&scene, scenes.iter().map(String::as_str));
-                let meant = meant.map_or(String::new(), |n| format!("; did you mean `{n}`?"));
-                return Err(refuse(leaf, format!("no scene of this sweep is called `{scene}`{meant}")));
+            if let When::On(scene) = when(leaf) {
+                known(leaf, &scene)?;
             }
         }
         let name = path.file_stem().map_or(String::new(), |s| s.to_string_lossy().into_owned());
-        Ok(Sweep { name, cells })
+        let mut sweep = Sweep { name, cells, clouds: BTreeMap::new(), mesh };
+        for leaf in &clouds {
+            let scene = leaf.key[CLOUDS.len()..].to_string();
+            if !sweep.is_in_space() {
+                return Err(refuse(leaf, "this sweep is in the plane, where there are no surfaces".into()));
+            }
+            known(leaf, &scene)?;
+            let Some(file) = leaf.value.as_str() else {
+                return Err(refuse(leaf, format!("expected the name of a PLY file, found {}", leaf.value)));
+            };
+            sweep.clouds.insert(scene, file.into());
+        }
+        Ok(sweep)
     }
 
     /// Whether the runs are in space, and not in the plane.
@@ -103,6 +138,24 @@ impl Sweep {
 
 fn refuse(leaf: &Leaf, message: String) -> ConfigError {
     ConfigError::Value { origin: leaf.origin.clone(), key: leaf.key.clone(), message }
+}
+
+/// Options of meshes with one more of the file's.
+fn with_option(options: MeshOptions, leaf: &Leaf) -> Result<MeshOptions, ConfigError> {
+    let number = |v: &Value| v.as_float().or_else(|| v.as_integer().map(|i| i as f64));
+    let numbers = || leaf.value.as_array()?.iter().map(number).collect::<Option<Vec<f64>>>();
+    let (found, expected) = match &leaf.key[MESH.len()..] {
+        "resolution" => {
+            let cubes = leaf.value.as_integer().and_then(|i| usize::try_from(i).ok());
+            (cubes.map(|cubes| options.with_cubes(cubes)), "a number of cubes along each side")
+        }
+        "threshold" => {
+            (number(&leaf.value).map(|threshold| MeshOptions { threshold, ..options }), "the density of the surface")
+        }
+        "bounds" => (numbers().and_then(|bounds| options.within(&bounds)), "a list of 2 or 6 numbers"),
+        _ => return Err(unknown(leaf.origin.clone(), &leaf.key, OPTIONS.map(String::from).iter())),
+    };
+    found.ok_or_else(|| refuse(leaf, format!("expected {expected}, found {}", leaf.value)))
 }
 
 /// The presets as they are; all of the plane, or all of space.
@@ -159,7 +212,11 @@ fn set(mut layered: Layered, leaf: &Leaf, presets: &[&str]) -> Result<Layered, C
             let nearest = nearest(written, presets.iter().copied()).map(|n| format!("preset.{n}"));
             ConfigError::UnknownKey { origin, key: format!("preset.{written}"), nearest }
         }
-        None => unknown(origin, &leaf.key, LISTS.map(String::from).iter().chain(&["set".into(), "preset".into()])),
+        None => unknown(
+            origin,
+            &leaf.key,
+            LISTS.map(String::from).iter().chain(&["set", "preset", "clouds", "mesh"].map(String::from)),
+        ),
     })
 }
 
@@ -280,6 +337,18 @@ mod tests {
                 "presets = [\"barf-small\"]\n[preset.barf-smal.optim]\nsteps = 3\n",
                 &["grid.toml:3: unknown key `preset.barf-smal`", "did you mean `preset.barf-small`?"],
             ),
+            (
+                "presets = [\"barf-small\"]\n[clouds]\nbuiltn = \"a.ply\"\n",
+                &["grid.toml:3: `clouds.builtn`", "did you mean `builtin`?"],
+            ),
+            (
+                "presets = [\"barf-small\"]\n[clouds]\nbuiltin = 3\n",
+                &["grid.toml:3", "the name of a PLY file, found 3"],
+            ),
+            ("presets = [\"barf-small\"]\n[mesh]\nbounds = [1]\n", &["grid.toml:3: `mesh.bounds`", "2 or 6 numbers"]),
+            ("presets = [\"barf-small\"]\n[mesh]\nresolution = -1\n", &["grid.toml:3", "a number of cubes"]),
+            ("presets = [\"barf-small\"]\n[mesh]\nthresold = 1\n", &["did you mean `mesh.threshold`?"]),
+            ("presets = [\"planar-l2g\"]\n[clouds]\nbuiltin = \"a.ply\"\n", &["grid.toml:3", "in the plane"]),
             ("presets = [\n", &["not valid TOML"]),
         ] {
             let message = load(text).unwrap_err().to_string();

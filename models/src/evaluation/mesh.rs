@@ -28,6 +28,24 @@ impl Default for MeshOptions {
     }
 }
 
+impl MeshOptions {
+    /// The same within bounds: the least and the largest number along each axis, or three such pairs; none where there are as many
+    /// as neither.
+    pub fn within(self, bounds: &[f64]) -> Option<MeshOptions> {
+        let (low, high) = match *bounds {
+            [low, high] => ([low; 3], [high; 3]),
+            [x0, x1, y0, y1, z0, z1] => ([x0, y0, z0], [x1, y1, z1]),
+            _ => return None,
+        };
+        Some(MeshOptions { low, high, ..self })
+    }
+
+    /// The same with so many cubes along each side.
+    pub fn with_cubes(self, cubes: usize) -> MeshOptions {
+        MeshOptions { points: [cubes.saturating_add(1); 3], ..self }
+    }
+}
+
 /// Triangles over shared vertices, in world units; seen from outside their corners go counterclockwise.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Mesh {

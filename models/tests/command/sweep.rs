@@ -165,3 +165,33 @@ fn bad_sweeps_are_refused_before_anything_runs() {
     mentions(&w.refuse(&["sweep", "grid.toml", "--out", "run"]), &["run is the folder of a run"]);
     assert_eq!(names(&w.path("run")), files);
 }
+
+/// A sweep with a reference of a scene has its distances in the tables, also of runs that were trained before.
+#[test]
+fn distances_to_references_are_measured() {
+    let w = Workplace::in_space();
+    w.succeed(&["train", "space.toml", "--out", "run"]);
+    let (threshold, resolution) = (["--mesh-threshold", "0.6"], ["--mesh-resolution", "16"]);
+    w.succeed(&[&["eval", "run", "--mesh", "whole.ply"][..], &threshold, &resolution].concat());
+    let file = |clouds: &str| {
+        let text = format!("presets = [\"space.toml\"]\nscenes = [\"scene\"]\nseeds = [0]\n{clouds}");
+        std::fs::write(w.path("grid.toml"), text).unwrap();
+    };
+    let distance = || w.json("grid/sweep.json")["runs"][0]["evaluation"]["cameras"]["mean"]["chamfer"].as_f64();
+    file("");
+    w.succeed(&["sweep", "grid.toml", "--out", "grid"]);
+    assert_eq!(distance(), None);
+    let clouds = "[clouds]\nscene = \"whole.ply\"\n[mesh]\nresolution = 16\n";
+    file(&format!("{clouds}threshold = 1e6\n"));
+    let output = w.run(&["sweep", "grid.toml", "--out", "grid"]);
+    mentions(&stderr(&output), &["stays without a Chamfer distance", "above the threshold 1000000"]);
+    assert!(output.status.success() && distance().is_none());
+    file(&format!("{clouds}threshold = 0.6\n"));
+    mentions(&w.succeed(&["sweep", "grid.toml", "--out", "grid"]), &["Chamfer distance"]);
+    let found = distance().unwrap();
+    assert!(found > 0.0 && found < 2.4 / 16.0, "{found}");
+    let run = &w.json("grid/scene-space-s0/evaluation.json")["cameras"]["mean"]["chamfer"];
+    assert_eq!(run.as_f64(), Some(found));
+    file("[clouds]\nscene = \"no.ply\"\n");
+    mentions(&w.refuse(&["sweep", "grid.toml", "--out", "grid"]), &["no.ply"]);
+}

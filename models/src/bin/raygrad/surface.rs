@@ -71,6 +71,25 @@ fn points(mesh: &Mesh, seed: u32) -> Result<Vec<[f64; 3]>, Error> {
     if mesh.triangles.is_empty() { Ok(mesh.vertices.clone()) } else { Ok(mesh.sample(POINTS, seed)?) }
 }
 
+fn found_mesh(explorer: &mut Explorer, options: &MeshOptions) -> Result<Mesh, Error> {
+    let shown = bar("meshing", "points");
+    let mesh = explorer.mesh(options, &|done, all| shown.show(done, all));
+    shown.finish();
+    mesh
+}
+
+fn distances(mesh: &Mesh, reference: &Mesh, layout: Layout) -> Result<Distances, Error> {
+    let limit = (layout == Layout::Dtu).then_some(DTU_LIMIT);
+    let found = chamfer(&points(mesh, 0)?, &points(reference, 1)?, limit)?;
+    Ok(Distances { accuracy: found.accuracy, completeness: found.completeness, mean: found.mean() })
+}
+
+/// The Chamfer distance between a run's surface and a reference.
+pub fn distance_to(explorer: &mut Explorer, options: &MeshOptions, reference: &Mesh) -> Result<f64, Error> {
+    let mesh = found_mesh(explorer, options)?;
+    Ok(distances(&mesh, reference, explorer.data.scene.layout)?.mean)
+}
+
 impl SurfaceArgs {
     /// The file that the mesh is to be written to.
     pub fn mesh_file(&self) -> &Option<PathBuf> {
@@ -83,19 +102,14 @@ impl SurfaceArgs {
 
     /// The reference and the grid, looked at before anything is computed.
     pub fn checked(&self) -> Result<(Option<Mesh>, MeshOptions), Error> {
-        let (low, high) = match self.mesh_bounds[..] {
-            [low, high] => ([low; 3], [high; 3]),
-            [x0, x1, y0, y1, z0, z1] => ([x0, y0, z0], [x1, y1, z1]),
-            _ => {
-                return Err(Error::from(raygrad::config::ConfigError::Value {
-                    origin: raygrad::config::Origin::Option("--mesh-bounds".into()),
-                    key: "mesh-bounds".into(),
-                    message: format!("expected 2 or 6 numbers, found {}", self.mesh_bounds.len()),
-                }));
-            }
+        let options = MeshOptions { threshold: self.mesh_threshold, ..MeshOptions::default() };
+        let Some(options) = options.with_cubes(self.mesh_resolution).within(&self.mesh_bounds) else {
+            return Err(Error::from(raygrad::config::ConfigError::Value {
+                origin: raygrad::config::Origin::Option("--mesh-bounds".into()),
+                key: "mesh-bounds".into(),
+                message: format!("expected 2 or 6 numbers, found {}", self.mesh_bounds.len()),
+            }));
         };
-        let points_a_side = self.mesh_resolution.saturating_add(1);
-        let options = MeshOptions { low, high, points: [points_a_side; 3], threshold: self.mesh_threshold };
         options.check()?;
         Ok((self.cloud.as_deref().map(Mesh::read_ply).transpose()?, options))
     }
@@ -105,18 +119,11 @@ impl SurfaceArgs {
         explorer: &mut Explorer,
         (reference, options): &(Option<Mesh>, MeshOptions),
     ) -> Result<Surface, Error> {
-        let shown = bar("meshing", "points");
-        let mesh = explorer.mesh(options, &|done, all| shown.show(done, all));
-        shown.finish();
-        let mesh = mesh?;
+        let mesh = found_mesh(explorer, options)?;
         if let Some(path) = &self.mesh {
             mesh.write(path)?;
         }
-        let limit = (explorer.data.scene.layout == Layout::Dtu).then_some(DTU_LIMIT);
-        let distances = reference.as_ref().map(|reference| -> Result<Distances, Error> {
-            let found = chamfer(&points(&mesh, 0)?, &points(reference, 1)?, limit)?;
-            Ok(Distances { accuracy: found.accuracy, completeness: found.completeness, mean: found.mean() })
-        });
+        let distances = reference.as_ref().map(|reference| distances(&mesh, reference, explorer.data.scene.layout));
         Ok(Surface { vertices: mesh.vertices.len(), triangles: mesh.triangles.len(), chamfer: distances.transpose()? })
     }
 

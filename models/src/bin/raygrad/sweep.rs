@@ -2,15 +2,17 @@
 
 use crate::eval::measure;
 use crate::progress::Progress as Shown;
+use crate::surface::distance_to;
 use crate::{listen, output_folder, print};
 use anyhow::bail;
 use clap::Args;
 use raygrad::config::{Sweep, SweepCell};
-use raygrad::evaluation::{Evaluation, Lpips};
+use raygrad::evaluation::{Evaluation, Lpips, Mesh, MeshOptions};
 use raygrad::run::files::write_atomically;
-use raygrad::run::{FolderError, RunFolder};
+use raygrad::run::{EVALUATION, FolderError, RunFolder};
 use raygrad::sweep::{Progress, results};
 use raygrad::{Error, Experiment};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::atomic::AtomicBool;
@@ -47,12 +49,21 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<ExitCode> {
     if args.resume && open {
         return Err(Error::from(FolderError::NothingToResume { path: folder }).into());
     }
+    sweep.mesh.check().map_err(Error::from)?;
+    let cloud = |(scene, file): (&String, &PathBuf)| Ok((scene.clone(), Mesh::read_ply(file)?));
+    let clouds: BTreeMap<String, Mesh> = sweep.clouds.iter().map(cloud).collect::<Result<_, Error>>()?;
     let stop = listen()?;
     let (mut done, mut failed) = (vec![], vec![]);
     for (i, cell) in sweep.cells.iter().enumerate() {
         note!("run {} of {}: {}", i + 1, sweep.cells.len(), cell.name);
         match train(cell, &folder, args.lpips.as_deref(), &stop) {
-            Ok(Some(evaluation)) => done.push((cell, evaluation)),
+            Ok(Some(evaluation)) => {
+                let evaluation = match clouds.get(&cell.layered.settings.scene_name()) {
+                    Some(cloud) => with_distance(&cell.folder(&folder), evaluation, &sweep.mesh, cloud)?,
+                    None => evaluation,
+                };
+                done.push((cell, evaluation));
+            }
             Ok(None) | Err(Error::Stopped) => {
                 print(&format!("stopped; continue with the same command and `--out {} --resume`\n", folder.display()))?;
                 return Ok(ExitCode::from(130));
@@ -115,6 +126,27 @@ fn train(
         Progress::Done(evaluation) => Ok(Some(*evaluation)),
         _ => Ok(None),
     }
+}
+
+/// What was measured of a finished run, with its surface's distance to a reference. A run without a surface stays as it is.
+fn with_distance(
+    run: &Path,
+    mut evaluation: Evaluation,
+    options: &MeshOptions,
+    reference: &Mesh,
+) -> Result<Evaluation, Error> {
+    if evaluation.cameras.mean.chamfer.is_some() {
+        return Ok(evaluation);
+    }
+    let mut explorer = Experiment::of_run(run)?.restored_explorer()?;
+    match distance_to(&mut explorer, options, reference) {
+        Ok(distance) => {
+            evaluation.cameras.mean.chamfer = Some(distance);
+            RunFolder::open(run)?.write(EVALUATION, evaluation.to_json().as_bytes())?;
+        }
+        Err(error) => note!("{} stays without a Chamfer distance: {error}", run.display()),
+    }
+    Ok(evaluation)
 }
 
 /// A finished run with LPIPS, which it was trained without.
