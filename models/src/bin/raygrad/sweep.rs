@@ -57,11 +57,13 @@ pub fn run(args: &SweepArgs) -> anyhow::Result<ExitCode> {
     for (i, cell) in sweep.cells.iter().enumerate() {
         note!("run {} of {}: {}", i + 1, sweep.cells.len(), cell.name);
         match train(cell, &folder, args.lpips.as_deref(), &stop) {
-            Ok(Some(evaluation)) => {
-                let evaluation = match clouds.get(&cell.layered.settings.scene_name()) {
-                    Some(cloud) => with_distance(&cell.folder(&folder), evaluation, &sweep.mesh, cloud)?,
-                    None => evaluation,
-                };
+            Ok(Some(mut evaluation)) => {
+                let cloud = clouds.get(&cell.layered.settings.scene_name());
+                if let Some(cloud) = cloud.filter(|_| evaluation.cameras.mean.chamfer.is_none())
+                    && let Err(error) = add_distance(&cell.folder(&folder), &mut evaluation, &sweep.mesh, cloud)
+                {
+                    note!("{} stays without a Chamfer distance: {error}", cell.name);
+                }
                 done.push((cell, evaluation));
             }
             Ok(None) | Err(Error::Stopped) => {
@@ -128,25 +130,11 @@ fn train(
     }
 }
 
-/// What was measured of a finished run, with its surface's distance to a reference. A run without a surface stays as it is.
-fn with_distance(
-    run: &Path,
-    mut evaluation: Evaluation,
-    options: &MeshOptions,
-    reference: &Mesh,
-) -> Result<Evaluation, Error> {
-    if evaluation.cameras.mean.chamfer.is_some() {
-        return Ok(evaluation);
-    }
+/// Adds the distance of a finished run's surface to a reference to what was measured of it.
+fn add_distance(run: &Path, evaluation: &mut Evaluation, options: &MeshOptions, reference: &Mesh) -> Result<(), Error> {
     let mut explorer = Experiment::of_run(run)?.restored_explorer()?;
-    match distance_to(&mut explorer, options, reference) {
-        Ok(distance) => {
-            evaluation.cameras.mean.chamfer = Some(distance);
-            RunFolder::open(run)?.write(EVALUATION, evaluation.to_json().as_bytes())?;
-        }
-        Err(error) => note!("{} stays without a Chamfer distance: {error}", run.display()),
-    }
-    Ok(evaluation)
+    evaluation.cameras.mean.chamfer = Some(distance_to(&mut explorer, options, reference)?);
+    Ok(RunFolder::open(run)?.write(EVALUATION, evaluation.to_json().as_bytes())?)
 }
 
 /// A finished run with LPIPS, which it was trained without.
