@@ -28,11 +28,11 @@ pub enum StepError {
     #[error("the new value of `{name}`, from {}, is {found}, expected {expected}", line(.at))]
     UpdateShape { name: String, expected: Box<Shape>, found: Box<Shape>, at: &'static Location<'static> },
     #[error(
-        "two updates of `{name}`, recorded at {} and at {}; one name is one buffer: a parameter is listed once, and two networks \
-         have two prefixes",
-        line(.at[0]), line(.at[1])
+        "two updates of `{name}`: of {} by {}, and of {} by {}; one name is one buffer, so a parameter is listed once, and two \
+         networks have two prefixes",
+        line(.of[0]), line(.by[0]), line(.of[1]), line(.by[1])
     )]
-    TwoUpdates { name: String, at: [&'static Location<'static>; 2] },
+    TwoUpdates { name: String, of: [&'static Location<'static>; 2], by: [&'static Location<'static>; 2] },
     #[error("`{op}` of {} goes over {domain}; a GPU counts to {} elements", line(.at), u32::MAX)]
     TooManyElements { op: String, domain: Axes, at: &'static Location<'static> },
     #[error("two outputs are called `{0}`")]
@@ -76,15 +76,16 @@ impl Step {
                 _ => names.insert(&input.name, (input, at)),
             };
         }
-        let mut updated: HashMap<&str, &Tensor> = HashMap::new();
+        let mut updated: HashMap<&str, [&'static Location; 2]> = HashMap::new();
         for (target, value) in &self.updates {
             let Some(input) = target.op_as::<Input>().filter(|i| matches!(i.role, Role::Parameter | Role::State))
             else {
                 return Err(StepError::NotAnInput { op: target.op().name().into(), at: target.source() });
             };
-            if let Some(before) = updated.insert(&input.name, target) {
-                let at = [before.source(), target.source()];
-                return Err(StepError::TwoUpdates { name: input.name.clone(), at });
+            let [of, by] = [target.source(), value.source()];
+            if let Some(before) = updated.insert(&input.name, [of, by]) {
+                let (of, by) = ([before[0], of], [before[1], by]);
+                return Err(StepError::TwoUpdates { name: input.name.clone(), of, by });
             }
             let fits = value.shape().axes.is_subset(&input.shape.axes)
                 && value.width() == input.shape.channels.count()

@@ -309,7 +309,7 @@ fn misfits_of_functions_name_the_call() {
         (fit_rigid_3d(&[], &over), "fit_rigid_3d: no points", line!()),
         (fit_homography(&x, &x, &over, Solver::Eigen, None), "fit_homography: points have 4 channels, not 2", line!()),
         (coarse_to_fine_weights(&x, 4, 0.5, 0.5), "coarse_to_fine_weights: 4 bands opening from 0.5 to 0.5", line!()),
-        (invert_pose(&x), "split_pose: channels 4 are no pose", line!()),
+        (invert_pose(&x), "invert_pose: channels 4 are no pose", line!()),
     ];
     for (t, problem, line) in cases {
         let text = t.error().expect("does not fit").to_string();
