@@ -260,7 +260,9 @@ fn data_that_changed_under_a_run_are_refused() {
     moved["perturbation"]["rotation"][1][0] = Value::from(number + 1e-3);
     std::fs::write(w.path("moved.json"), moved.to_string()).unwrap();
     mentions(&w.refuse(&resumed), &["other perturbations than moved.json gives now"]);
-    // Before anything is measured, what has no place is refused.
+    std::fs::write(w.path("drawn/perturbation.json"), "{\"image_size_hw\": [24").unwrap();
+    mentions(&w.refuse(&["eval", "drawn"]), &["drawn/perturbation.json: not a perturbation file"]);
+    // What has no place is refused before anything is looked at.
     std::fs::remove_file(w.path("drawn/evaluation.json")).unwrap();
     std::fs::create_dir(w.path("drawn/evaluation.json")).unwrap();
     mentions(&w.refuse(&["eval", "drawn"]), &["cannot write drawn/evaluation.json"]);
