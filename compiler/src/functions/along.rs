@@ -1,18 +1,18 @@
 //! Parts of an axis, and axes put one after the other: gathers at positions, whose adjoints sum into them in order.
 
-use crate::graph::{Axis, Tensor, function};
+use crate::graph::{Axis, Called, Tensor, function};
 
 /// Elements `start..start + into.size()` along `axis`, which the new axis `into` replaces.
 #[track_caller]
 pub fn slice_along(x: &Tensor, axis: &Axis, start: usize, into: &Axis) -> Tensor {
-    let _called = function("slice_along");
-    if let Err(bad) = is_new("slice_along", &[x], into) {
+    let called = function("slice_along");
+    if let Err(bad) = is_new(&called, &[x], into) {
         return bad;
     }
     if start.checked_add(into.size()).is_none_or(|end| end > axis.size()) {
         let problem = format!("{} elements from {start} on along `{axis}`", into.size());
         let hint = format!("`{}` has elements 0 to {}", axis.name(), axis.size().saturating_sub(1));
-        return Tensor::misfit("slice_along", &[x], problem, hint);
+        return called.misfit(&[x], problem, hint);
     }
     moved(x, axis, into, start as u32)
 }
@@ -26,19 +26,19 @@ fn moved(x: &Tensor, axis: &Axis, into: &Axis, by: u32) -> Tensor {
 /// The parts one after the other along the new axis `into`: each a tensor and the axis of it that `into` replaces.
 #[track_caller]
 pub fn concat_along(parts: &[(&Tensor, &Axis)], into: &Axis) -> Tensor {
-    let _called = function("concat_along");
+    let called = function("concat_along");
     let tensors: Vec<&Tensor> = parts.iter().map(|p| p.0).collect();
-    if let Err(bad) = is_new("concat_along", &tensors, into) {
+    if let Err(bad) = is_new(&called, &tensors, into) {
         return bad;
     }
     let size: usize = parts.iter().map(|p| p.1.size()).sum();
     let Some(((last, axis), others)) = parts.split_last().filter(|_| size == into.size()) else {
         let problem = format!("{} parts of {size} elements together do not fill `{into}`", parts.len());
-        return Tensor::misfit("concat_along", &tensors, problem, "the new axis has the size of all parts together");
+        return called.misfit(&tensors, problem, "the new axis has the size of all parts together");
     };
     if let Some(other) = tensors.iter().find(|t| t.channels() != last.channels()) {
         let problem = format!("channels {} and {} do not match", other.channels(), last.channels());
-        return Tensor::misfit("concat_along", &tensors, problem, "all parts have the same channels");
+        return called.misfit(&tensors, problem, "all parts have the same channels");
     }
     let index = Tensor::index(into);
     // Positions outside of a part read its last slot, which is not chosen.
@@ -54,12 +54,12 @@ pub fn concat_along(parts: &[(&Tensor, &Axis)], into: &Axis) -> Tensor {
 
 /// Refuses an axis that a tensor has already.
 #[track_caller]
-fn is_new(name: &'static str, tensors: &[&Tensor], into: &Axis) -> Result<(), Tensor> {
+fn is_new(called: &Called, tensors: &[&Tensor], into: &Axis) -> Result<(), Tensor> {
     match tensors.iter().find(|t| t.axes().contains(into)) {
         None => Ok(()),
         Some(t) => {
             let problem = format!("{} has the axis `{into}` already", t.shape());
-            Err(Tensor::misfit(name, tensors, problem, "make a new axis"))
+            Err(called.misfit(tensors, problem, "make a new axis"))
         }
     }
 }

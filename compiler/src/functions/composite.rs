@@ -74,9 +74,9 @@ pub fn composite_above(
     length: &Tensor,
     sample: &Axis,
 ) -> Composite {
-    let _called = function("composite");
+    let called = function("composite");
     for (what, t) in [("densities", density), ("depths", depth), ("lengths", length)] {
-        if let Err(bad) = expect_width("composite", what, t, 1) {
+        if let Err(bad) = expect_width(&called, what, t, 1) {
             return Composite { color: bad.clone(), depth: bad.clone(), opacity: bad.clone(), weights: bad };
         }
     }

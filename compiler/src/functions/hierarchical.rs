@@ -32,8 +32,8 @@ pub fn fine_depths(
     far: &Tensor,
     spread: Spread,
 ) -> Tensor {
-    let _called = function("fine_depths");
-    if let Err(bad) = expect_width("fine_depths", "weights", weights, 1) {
+    let called = function("fine_depths");
+    if let Err(bad) = expect_width(&called, "weights", weights, 1) {
         return bad;
     }
     let bins = sample.size() as f64;
@@ -55,11 +55,11 @@ pub fn fine_depths(
 /// along `sample` come first. Nothing is differentiated through it.
 #[track_caller]
 pub fn merge_depths(depth: &Tensor, sample: &Axis, more: &Tensor, fine: &Axis, merged: &Axis) -> Tensor {
-    let _called = function("merge_depths");
+    let called = function("merge_depths");
     let (s, f) = (sample.size(), fine.size());
     if merged.size() != s + f {
         let problem = format!("{s} and {f} depths in a list of {}", merged.size());
-        return Tensor::misfit("merge_depths", &[depth, more], problem, format!("a list of {} would fit", s + f));
+        return called.misfit(&[depth, more], problem, format!("a list of {} would fit", s + f));
     }
     let entry = Axis::new("entry", s + f);
     let other = Axis::new("other", s + f);

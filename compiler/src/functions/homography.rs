@@ -34,9 +34,9 @@ const EPSILON: f64 = 1e-8;
 /// identity, and neither value nor gradient sees the points. Two identical point sets are such a case.
 #[track_caller]
 pub fn fit_homography(x: &Tensor, y: &Tensor, over: &Axes, solver: Solver, degenerate: Option<&Tensor>) -> Tensor {
-    let _called = function("fit_homography");
+    let called = function("fit_homography");
     for t in [x, y] {
-        if let Err(bad) = expect_width("fit_homography", "points", t, 2) {
+        if let Err(bad) = expect_width(&called, "points", t, 2) {
             return bad;
         }
     }

@@ -20,14 +20,14 @@ impl ImageTable {
     /// the pixels if they are trained.
     #[track_caller]
     pub fn bilinear(&self, at: &Tensor) -> Tensor {
-        let _called = function("bilinear");
-        if let Err(bad) = expect_width("bilinear", "coordinates", at, 2) {
+        let called = function("bilinear");
+        if let Err(bad) = expect_width(&called, "coordinates", at, 2) {
             return bad;
         }
         if self.texel.size() != self.width * self.height || !self.pixels.axes().contains(&self.texel) {
             let problem = format!("{} is no table of {} x {} pixels", self.pixels.shape(), self.width, self.height);
             let hint = format!("the axis `{}` has one element a pixel", self.texel.name());
-            return Tensor::misfit("bilinear", &[&self.pixels], problem, hint);
+            return called.misfit(&[&self.pixels], problem, hint);
         }
         let low = at.floor();
         let high = &low + 1.0;

@@ -4,7 +4,7 @@
 //! more unknowns see [`solve_symmetric`](super::matrix::solve_symmetric).
 
 use super::matrix::{apply, matmul};
-use crate::graph::{Channels, Tensor, function};
+use crate::graph::{Called, Channels, Tensor, function};
 use crate::ops::custom::custom_adjoint;
 
 /// Most rows: the number of minors grows like `4^n`.
@@ -13,8 +13,8 @@ const MOST: usize = 4;
 /// Determinant of a matrix `(n, n)`, n at most 4; 1 channel.
 #[track_caller]
 pub fn determinant(a: &Tensor) -> Tensor {
-    let _called = function("determinant");
-    match square(a, "determinant") {
+    let called = function("determinant");
+    match square(a, &called) {
         Ok(n) => minors(a, n, &[((0..n).collect(), (0..n).collect())]),
         Err(bad) => bad,
     }
@@ -24,8 +24,8 @@ pub fn determinant(a: &Tensor) -> Tensor {
 /// itself, `-B^T g B^T`.
 #[track_caller]
 pub fn inverse(a: &Tensor) -> Tensor {
-    let _called = function("inverse");
-    let n = match square(a, "inverse") {
+    let called = function("inverse");
+    let n = match square(a, &called) {
         Ok(n) => n,
         Err(bad) => return bad,
     };
@@ -50,12 +50,12 @@ pub fn inverse(a: &Tensor) -> Tensor {
 /// `A^-1 b` of a matrix `(n, n)`, n at most 4, and n channels.
 #[track_caller]
 pub fn solve(a: &Tensor, b: &Tensor) -> Tensor {
-    let _called = function("solve");
-    match square(a, "solve") {
+    let called = function("solve");
+    match square(a, &called) {
         Ok(n) if b.width() == n => apply(&inverse(a), b),
         Ok(n) => {
             let problem = format!("a matrix {} and a right side of {} channels", a.channels(), b.channels());
-            Tensor::misfit("solve", &[a, b], problem, format!("the right side has {n} channels"))
+            called.misfit(&[a, b], problem, format!("the right side has {n} channels"))
         }
         Err(bad) => bad,
     }
@@ -63,7 +63,7 @@ pub fn solve(a: &Tensor, b: &Tensor) -> Tensor {
 
 /// Rows of a square matrix that is small enough.
 #[track_caller]
-fn square(a: &Tensor, name: &'static str) -> Result<usize, Tensor> {
+fn square(a: &Tensor, called: &Called) -> Result<usize, Tensor> {
     match a.channels() {
         Channels::Matrix(r, c) if r == c && r <= MOST => Ok(r),
         other => {
@@ -73,7 +73,7 @@ fn square(a: &Tensor, name: &'static str) -> Result<usize, Tensor> {
                 Channels::Matrix(..) => "a matrix (n, n) would fit",
                 Channels::Vector(_) => "reshape the channels to (n, n)",
             };
-            Err(Tensor::misfit(name, &[a], problem, hint))
+            Err(called.misfit(&[a], problem, hint))
         }
     }
 }

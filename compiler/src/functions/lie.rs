@@ -36,9 +36,9 @@ fn factorial(n: usize) -> f64 {
 /// `a x b` of three channels each.
 #[track_caller]
 pub fn cross(a: &Tensor, b: &Tensor) -> Tensor {
-    let _called = function("cross");
+    let called = function("cross");
     for t in [a, b] {
-        if let Err(bad) = expect_width("cross", "vectors", t, 3) {
+        if let Err(bad) = expect_width(&called, "vectors", t, 3) {
             return bad;
         }
     }
@@ -48,8 +48,8 @@ pub fn cross(a: &Tensor, b: &Tensor) -> Tensor {
 /// Rotation `(3, 3)` of a rotation vector, of at most 5 radians: of 12 what the series gives is no rotation.
 #[track_caller]
 pub fn so3_exp(w: &Tensor) -> Tensor {
-    let _called = function("so3_exp");
-    match expect_width("so3_exp", "rotation vectors", w, 3) {
+    let called = function("so3_exp");
+    match expect_width(&called, "rotation vectors", w, 3) {
         Ok(()) => rotation(w, &series(&(w * w).sum_channels(), &[1, 2])),
         Err(bad) => bad,
     }
@@ -72,8 +72,8 @@ fn rotation(w: &Tensor, coefficients: &Tensor) -> Tensor {
 /// ([`so3_exp`]), then three of translation.
 #[track_caller]
 pub fn se3_exp(twist: &Tensor) -> Tensor {
-    let _called = function("se3_exp");
-    if let Err(bad) = expect_width("se3_exp", "twists", twist, 6) {
+    let called = function("se3_exp");
+    if let Err(bad) = expect_width(&called, "twists", twist, 6) {
         return bad;
     }
     let (w, u) = (twist.slice(0..3), twist.slice(3..6));
@@ -87,8 +87,8 @@ pub fn se3_exp(twist: &Tensor) -> Tensor {
 /// Rotation `(2, 2)` by an angle: `[[cos, -sin], [sin, cos]]`.
 #[track_caller]
 pub fn so2_exp(angle: &Tensor) -> Tensor {
-    let _called = function("so2_exp");
-    match expect_width("so2_exp", "angles", angle, 1) {
+    let called = function("so2_exp");
+    match expect_width(&called, "angles", angle, 1) {
         Ok(()) => turn(&angle.cos(), &angle.sin()),
         Err(bad) => bad,
     }
@@ -104,8 +104,8 @@ fn turn(c: &Tensor, s: &Tensor) -> Tensor {
 /// and `B = (1 - cos(theta)) / theta`, good for `|theta| < 5`.
 #[track_caller]
 pub fn se2_exp(motion: &Tensor) -> Tensor {
-    let _called = function("se2_exp");
-    if let Err(bad) = expect_width("se2_exp", "rigid motions", motion, 3) {
+    let called = function("se2_exp");
+    if let Err(bad) = expect_width(&called, "rigid motions", motion, 3) {
         return bad;
     }
     let (u, theta) = (motion.slice(0..2), motion.slice(2..3));
@@ -117,8 +117,8 @@ pub fn se2_exp(motion: &Tensor) -> Tensor {
 /// Homography `(3, 3)` of eight channels: `expm [[h5, h3, h1], [h4, -h5 - h6, h2], [h7, h8, h6]]`, of determinant 1.
 #[track_caller]
 pub fn sl3_exp(h: &Tensor) -> Tensor {
-    let _called = function("sl3_exp");
-    if let Err(bad) = expect_width("sl3_exp", "homography vectors", h, 8) {
+    let called = function("sl3_exp");
+    if let Err(bad) = expect_width(&called, "homography vectors", h, 8) {
         return bad;
     }
     let middle = -(h.slice(4..5) + h.slice(5..6));
@@ -135,14 +135,9 @@ const HALVINGS: i32 = 2;
 /// necessary to evaluate polynomials, 1973): seven products in all.
 #[track_caller]
 pub fn expm(a: &Tensor) -> Tensor {
-    let _called = function("expm");
+    let called = function("expm");
     let crate::graph::Channels::Matrix(n, _) = a.channels() else {
-        return Tensor::misfit(
-            "expm",
-            &[a],
-            format!("channels {} are no matrix", a.channels()),
-            "reshape them to (n, n)",
-        );
+        return called.misfit(&[a], format!("channels {} are no matrix", a.channels()), "reshape them to (n, n)");
     };
     let one = identity(n);
     let a1 = a * 0.5f64.powi(HALVINGS);

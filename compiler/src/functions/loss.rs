@@ -21,11 +21,11 @@ pub fn mean_absolute_error(a: &Tensor, b: &Tensor) -> Tensor {
 /// Blanc-Feraud, Aubert, Barlaud, Two deterministic half-quadratic regularization algorithms for computed imaging, ICIP 1994).
 #[track_caller]
 pub fn charbonnier(a: &Tensor, b: &Tensor, epsilon: f64) -> Tensor {
-    let _called = function("charbonnier");
+    let called = function("charbonnier");
     // Beyond, the square is no normal number of single precision; NaN is in no range.
     if !(1e-18..=1e18).contains(&epsilon) {
         let hint = "epsilon is a small positive difference, such as 1e-3";
-        return Tensor::misfit("charbonnier", &[a, b], format!("epsilon is {epsilon}"), hint);
+        return called.misfit(&[a, b], format!("epsilon is {epsilon}"), hint);
     }
     let difference = a - b;
     (&difference * &difference + epsilon * epsilon).sqrt().mean_all()

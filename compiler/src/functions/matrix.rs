@@ -20,14 +20,14 @@ fn eye(n: usize) -> Vec<f64> {
 /// Product of small matrices, `(m, k)` times `(k, n)`, element by element of the axes.
 #[track_caller]
 pub fn matmul(a: &Tensor, b: &Tensor) -> Tensor {
-    let _called = function("matmul");
+    let called = function("matmul");
     let (Channels::Matrix(m, k), Channels::Matrix(k2, n)) = (a.channels(), b.channels()) else {
         let hint = "reshape the channels to (m, k) and (k, n)";
-        return Tensor::misfit("matmul", &[a, b], "both operands must be matrices", hint);
+        return called.misfit(&[a, b], "both operands must be matrices", hint);
     };
     if k != k2 {
         let problem = format!("{k} columns do not meet {k2} rows");
-        return Tensor::misfit("matmul", &[a, b], problem, "the inner sizes must agree; transpose() one of them?");
+        return called.misfit(&[a, b], problem, "the inner sizes must agree; transpose() one of them?");
     }
     let left: Vec<usize> = (0..m * n * k).map(|i| i / (n * k) * k + i % k).collect();
     let right: Vec<usize> = (0..m * n * k).map(|i| i % k * n + i / k % n).collect();
@@ -42,7 +42,7 @@ fn runs(count: usize, length: usize) -> Vec<Vec<u32>> {
 /// `A x`: a matrix `(m, k)` applied to a vector of `k` channels.
 #[track_caller]
 pub fn apply(a: &Tensor, x: &Tensor) -> Tensor {
-    let _called = function("apply");
+    let called = function("apply");
     match a.channels() {
         Channels::Matrix(m, k) if x.width() == k => {
             let cycled: Vec<usize> = (0..m * k).map(|i| i % k).collect();
@@ -50,7 +50,7 @@ pub fn apply(a: &Tensor, x: &Tensor) -> Tensor {
         }
         other => {
             let problem = format!("channels {other} do not apply to {} channels", x.channels());
-            Tensor::misfit("apply", &[a, x], problem, format!("a matrix (m, {}) would fit", x.width()))
+            called.misfit(&[a, x], problem, format!("a matrix (m, {}) would fit", x.width()))
         }
     }
 }
@@ -58,7 +58,7 @@ pub fn apply(a: &Tensor, x: &Tensor) -> Tensor {
 /// `R x + t` for an affine map `[R | t]`, `(m, k + 1)`, and `k` channels.
 #[track_caller]
 pub fn apply_affine(map: &Tensor, x: &Tensor) -> Tensor {
-    let _called = function("apply_affine");
+    let called = function("apply_affine");
     match map.channels() {
         Channels::Matrix(m, k1) if k1 == x.width() + 1 => {
             let (linear, offset) = split_affine(map, m, k1 - 1);
@@ -66,7 +66,7 @@ pub fn apply_affine(map: &Tensor, x: &Tensor) -> Tensor {
         }
         other => {
             let problem = format!("channels {other} are no affine map of {} channels", x.channels());
-            Tensor::misfit("apply_affine", &[map, x], problem, format!("a map (m, {}) would fit", x.width() + 1))
+            called.misfit(&[map, x], problem, format!("a map (m, {}) would fit", x.width() + 1))
         }
     }
 }
@@ -82,7 +82,7 @@ fn split_affine(map: &Tensor, m: usize, k: usize) -> (Tensor, Tensor) {
 /// `[R | t]` of a matrix `(m, k)` and `m` channels.
 #[track_caller]
 pub fn join_affine(linear: &Tensor, offset: &Tensor) -> Tensor {
-    let _called = function("join_affine");
+    let called = function("join_affine");
     match linear.channels() {
         Channels::Matrix(m, k) if offset.width() == m => {
             let place = |i: usize| if i % (k + 1) < k { i / (k + 1) * k + i % (k + 1) } else { m * k + i / (k + 1) };
@@ -91,7 +91,7 @@ pub fn join_affine(linear: &Tensor, offset: &Tensor) -> Tensor {
         }
         other => {
             let problem = format!("a matrix {other} and an offset of {} channels", offset.channels());
-            Tensor::misfit("join_affine", &[linear, offset], problem, "the offset has one channel a row")
+            called.misfit(&[linear, offset], problem, "the offset has one channel a row")
         }
     }
 }
@@ -99,11 +99,12 @@ pub fn join_affine(linear: &Tensor, offset: &Tensor) -> Tensor {
 /// Rotation `(n, n)` and translation of a pose `[R | t]`, `(n, n + 1)`.
 #[track_caller]
 pub fn split_pose(pose: &Tensor) -> (Tensor, Tensor) {
+    let called = function("split_pose");
     match pose.channels() {
         Channels::Matrix(n, n1) if n1 == n + 1 => split_affine(pose, n, n),
         other => {
             let problem = format!("channels {other} are no pose");
-            let bad = Tensor::misfit("split_pose", &[pose], problem, "a pose is (n, n + 1): rotation and translation");
+            let bad = called.misfit(&[pose], problem, "a pose is (n, n + 1): rotation and translation");
             (bad.clone(), bad)
         }
     }
@@ -132,10 +133,10 @@ pub const PROJECTION_EPSILON: f64 = 1e-8;
 /// `(q_x, q_y) / (q_z + 1e-8)` with `q = H (x, y, 1)`: a homography `(3, 3)` applied to two channels.
 #[track_caller]
 pub fn apply_homography(h: &Tensor, x: &Tensor) -> Tensor {
-    let _called = function("apply_homography");
+    let called = function("apply_homography");
     if h.channels() != Channels::Matrix(3, 3) {
         let problem = format!("channels {} are no homography", h.channels());
-        return Tensor::misfit("apply_homography", &[h, x], problem, "a homography is (3, 3)");
+        return called.misfit(&[h, x], problem, "a homography is (3, 3)");
     }
     // The homography is an affine map to three channels.
     let q = apply_affine(h, x);
@@ -155,11 +156,11 @@ const NEGATIVE: f64 = 1e-5;
 /// from eigenvectors: that loses all digits where eigenvalues meet, while the solution does not notice.
 #[track_caller]
 pub fn solve_symmetric(g: &Tensor, b: &Tensor) -> Tensor {
-    let _called = function("solve_symmetric");
+    let called = function("solve_symmetric");
     if !matches!(g.channels(), Channels::Matrix(r, c) if r == c && b.width() == r) {
         let problem = format!("channels {} are no system for {} channels", g.channels(), b.channels());
         let hint = "the matrix is (n, n), the right side has n channels";
-        return Tensor::misfit("solve_symmetric", &[g, b], problem, hint);
+        return called.misfit(&[g, b], problem, hint);
     }
     let (values, vectors) = g.stop_gradient().sym_eig();
     let largest = values.abs().max_channels();

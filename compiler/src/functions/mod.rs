@@ -32,14 +32,14 @@ pub mod rigid_fit;
 pub mod vector;
 pub mod weight_norm;
 
-use crate::graph::Tensor;
+use crate::graph::{Called, Tensor};
 
-/// `t` if it has `n` channels, else what [`Tensor::misfit`] gives for function `name`.
+/// `t` if it has `n` channels, else what [`Called::misfit`] gives.
 #[track_caller]
-pub(crate) fn expect_width(name: &'static str, what: &str, t: &Tensor, n: usize) -> Result<(), Tensor> {
+pub(crate) fn expect_width(called: &Called, what: &str, t: &Tensor, n: usize) -> Result<(), Tensor> {
     if t.width() == n || t.error().is_some() {
         return Ok(());
     }
     let problem = format!("{what} have {} channels, not {n}", t.channels());
-    Err(Tensor::misfit(name, &[t], problem, format!("{what} have {n} channels")))
+    Err(called.misfit(&[t], problem, format!("{what} have {n} channels")))
 }

@@ -8,7 +8,7 @@
 //! The angle is reduced to `-pi..pi` before the sine is taken, in turns, where that is exact: `h = 2^(k-1) x` (a power of
 //! two), plus a quarter turn for the cosine, `t = h - floor(h + 1/2)`, `sin(2 pi t)`.
 
-use crate::graph::{Tensor, function};
+use crate::graph::{Called, Tensor, function};
 use crate::ops::pick::concat;
 use std::f64::consts::{PI, TAU};
 
@@ -21,19 +21,19 @@ pub fn encoded_width(n: usize, bands: usize) -> usize {
 /// run of channels, not a node each.
 #[track_caller]
 pub fn positional_encoding(x: &Tensor, bands: usize, weights: Option<&Tensor>) -> Tensor {
-    let _called = function("positional_encoding");
+    let called = function("positional_encoding");
     // Channel 2 L i + j is wave j of dimension i: a sine for j < L, a cosine after that.
     let place = |c: usize| Wave { source: c / (2 * bands), band: c % bands, cosine: c / bands % 2 == 1 };
-    encode("positional_encoding", x, bands, weights, place)
+    encode(&called, x, bands, weights, place)
 }
 
 /// The same waves in another order: for each frequency the sines of all channels of `x`, then their cosines.
 #[track_caller]
 pub fn frequency_encoding(x: &Tensor, bands: usize, weights: Option<&Tensor>) -> Tensor {
-    let _called = function("frequency_encoding");
+    let called = function("frequency_encoding");
     let n = x.width();
     let place = |c: usize| Wave { source: c % n, band: c / (2 * n), cosine: c / n % 2 == 1 };
-    encode("frequency_encoding", x, bands, weights, place)
+    encode(&called, x, bands, weights, place)
 }
 
 /// What one channel of an encoding holds.
@@ -46,7 +46,7 @@ struct Wave {
 
 #[track_caller]
 fn encode(
-    name: &'static str,
+    called: &Called,
     x: &Tensor,
     bands: usize,
     weights: Option<&Tensor>,
@@ -64,7 +64,7 @@ fn encode(
     let t = &h - (&h + 0.5).floor();
     let mut wave = (t * TAU).sin();
     if let Some(w) = weights {
-        if let Err(bad) = super::expect_width(name, "band weights", w, bands) {
+        if let Err(bad) = super::expect_width(called, "band weights", w, bands) {
             return bad;
         }
         wave = wave * w.pick(&band);
@@ -75,10 +75,10 @@ fn encode(
 /// Weights of the bands while training progresses from 0 to 1; they open one after the other from `start` to `end`.
 #[track_caller]
 pub fn coarse_to_fine_weights(progress: &Tensor, bands: usize, start: f64, end: f64) -> Tensor {
-    let _called = function("coarse_to_fine_weights");
+    let called = function("coarse_to_fine_weights");
     if end <= start || bands == 0 {
         let problem = format!("{bands} bands opening from {start} to {end}");
-        return Tensor::misfit("coarse_to_fine_weights", &[progress], problem, "the window must not be empty");
+        return called.misfit(&[progress], problem, "the window must not be empty");
     }
     let alpha = (progress - start) * (bands as f64 / (end - start));
     let band: Vec<f64> = (0..bands).map(|k| k as f64).collect();

@@ -7,7 +7,7 @@
 use super::expect_width;
 use super::lie::so2_exp;
 use super::matrix::{apply, join_affine};
-use crate::graph::{Axes, Tensor, function};
+use crate::graph::{Axes, Called, Tensor, function};
 use crate::ops::pick::concat;
 
 /// Sum over `over`, counting what `t` does not depend on once for every element.
@@ -18,16 +18,16 @@ fn sum_all(t: &Tensor, over: &Axes) -> Tensor {
 
 /// Refuses point sets of other than `n` channels.
 #[track_caller]
-fn expect_points(name: &'static str, x: &Tensor, y: &Tensor, n: usize) -> Result<(), Tensor> {
-    expect_width(name, "points", x, n)?;
-    expect_width(name, "points", y, n)
+fn expect_points(called: &Called, x: &Tensor, y: &Tensor, n: usize) -> Result<(), Tensor> {
+    expect_width(called, "points", x, n)?;
+    expect_width(called, "points", y, n)
 }
 
 /// Rotation about the origin, `(2, 2)`, that takes points `x` to `y`; the points lie along `over`.
 #[track_caller]
 pub fn fit_rotation_2d(x: &Tensor, y: &Tensor, over: &Axes) -> Tensor {
-    let _called = function("fit_rotation_2d");
-    if let Err(bad) = expect_points("fit_rotation_2d", x, y, 2) {
+    let called = function("fit_rotation_2d");
+    if let Err(bad) = expect_points(&called, x, y, 2) {
         return bad;
     }
     let sine = (x * y.pick(&[1, 0]) * Tensor::constant(&[1.0, -1.0])).sum_channels();
@@ -56,14 +56,14 @@ pub fn fit_rigid_2d(x: &Tensor, y: &Tensor, over: &Axes) -> Tensor {
 /// Rigid motion `[R | t]`, `(3, 4)`, that takes points `x` to `y`, over all `pairs` (x, y) of point sets together.
 #[track_caller]
 pub fn fit_rigid_3d(pairs: &[(&Tensor, &Tensor)], over: &Axes) -> Tensor {
-    let _called = function("fit_rigid_3d");
+    let called = function("fit_rigid_3d");
     let Some((first_x, first_y)) = pairs.first() else {
-        return Tensor::misfit("fit_rigid_3d", &[], "no points", "give at least one pair of point sets");
+        return called.misfit(&[], "no points", "give at least one pair of point sets");
     };
     let share = 1.0 / (pairs.len() * over.elements()) as f64;
     let (mut mean_x, mut mean_y) = (sum_all(first_x, over), sum_all(first_y, over));
     for (x, y) in pairs {
-        if let Err(bad) = expect_points("fit_rigid_3d", x, y, 3) {
+        if let Err(bad) = expect_points(&called, x, y, 3) {
             return bad;
         }
     }

@@ -9,7 +9,8 @@
 //! back from it into the same domain needs no cut (see [`lines`]).
 //!
 //! What a region needs from an earlier region of the same domain is either stored or computed again, whatever takes less
-//! time on the target (see [`store`]); only what is compared with its own maximum is always stored (see [`extremes`]). On a GPU, parts of a stored concatenation are read back from it (see [`reread`]), and layers of
+//! time on the target (see [`store`]); only what is compared with its own maximum is always stored (see [`extremes`]). On a GPU,
+//! parts of a stored concatenation are read back from it (see [`reread`]), and layers of
 //! narrow networks need no cut (see [`resident`]).
 
 mod build;

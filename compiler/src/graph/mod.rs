@@ -7,4 +7,4 @@ pub mod tensor;
 pub use axis::{Axes, Axis};
 pub use error::{Misfit, RecordError};
 pub use shape::{Channels, Shape};
-pub use tensor::{Tensor, function, topological, with_source};
+pub use tensor::{Called, Tensor, function, topological, with_source};

@@ -46,14 +46,21 @@ thread_local! {
 
 /// Until it is dropped, tensors are recorded on behalf of whom it was made for.
 pub struct Called {
+    name: &'static str,
     before: Behalf,
     /// Not for other threads.
     _here: PhantomData<*const ()>,
 }
 
 impl Called {
-    fn new(of: Behalf) -> Called {
-        Called { before: BEHALF.replace(of), _here: PhantomData }
+    fn new(name: &'static str, of: Behalf) -> Called {
+        Called { name, before: BEHALF.replace(of), _here: PhantomData }
+    }
+
+    /// What [`Tensor::misfit`] gives, for the function that was called.
+    #[track_caller]
+    pub fn misfit(&self, operands: &[&Tensor], problem: impl Into<String>, hint: impl Into<String>) -> Tensor {
+        Tensor::misfit(self.name, operands, problem, hint)
     }
 }
 
@@ -65,7 +72,7 @@ impl Drop for Called {
 
 /// Runs `f`; every tensor recorded inside gets the source line `at`. Used by the passes that record on a user's behalf.
 pub fn with_source<T>(at: &'static Location<'static>, f: impl FnOnce() -> T) -> T {
-    let _called = Called::new(Behalf { source: Some(at), ..BEHALF.get() });
+    let _called = Called::new("", Behalf { source: Some(at), ..BEHALF.get() });
     f()
 }
 
@@ -76,7 +83,7 @@ pub fn with_source<T>(at: &'static Location<'static>, f: impl FnOnce() -> T) -> 
 pub fn function(name: &'static str) -> Called {
     let of = BEHALF.get();
     let source = of.source.unwrap_or(Location::caller());
-    Called::new(Behalf { source: Some(source), function: of.function.or(Some(name)) })
+    Called::new(name, Behalf { source: Some(source), function: of.function.or(Some(name)) })
 }
 
 impl Tensor {

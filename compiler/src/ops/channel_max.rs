@@ -1,6 +1,6 @@
 //! Maximum over the channels, NaN if one is; its gradient is shared equally between ties.
 
-use super::{Form, Op, Sample, expect_dtype, pointwise::unary, reduce::larger};
+use super::{Form, Op, Sample, expect_dtype, pointwise::unary, reduce::{larger, without_nan}};
 use crate::cost::Work;
 use crate::graph::{Channels, Misfit, Shape, Tensor, function};
 use crate::reference::{Array, Lane};
@@ -54,11 +54,8 @@ impl Tensor {
     #[track_caller]
     pub fn argmax_channels(&self) -> Tensor {
         let _called = function("argmax_channels");
-        if let Err(m) = expect_dtype(self.shape(), DType::F32, 0) {
-            return Tensor::misfit("argmax_channels", &[self], m.problem, m.hint);
-        }
         // Not the channel that equals the maximum: a value computed twice may differ in its rounding.
-        let number = self.equal(self).select(self, &Tensor::scalar(f64::from(f32::MIN)));
+        let number = without_nan(self);
         let mut most = number.ch(0);
         let mut at = most.less_than(&most);
         for c in 1..self.width() {

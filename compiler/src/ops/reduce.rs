@@ -80,6 +80,13 @@ pub(crate) fn larger(a: f64, b: f64) -> f64 {
     if a > b || a.is_nan() { a } else { b }
 }
 
+/// The same values, NaN and what is less than all finite numbers being the least of those.
+#[track_caller]
+pub(crate) fn without_nan(x: &Tensor) -> Tensor {
+    let least = Tensor::scalar(f64::from(f32::MIN));
+    x.max(&least).equal(x).select(x, &least)
+}
+
 impl Tensor {
     /// Sum over the given axes.
     #[track_caller]
@@ -123,13 +130,12 @@ impl Tensor {
     /// nothing.
     #[track_caller]
     pub fn argmax_over(&self, axis: &Axis) -> Tensor {
-        let _called = function("argmax_over");
+        let called = function("argmax_over");
         if axis.size() > MOST_POSITIONS {
             let problem = format!("`{axis}` has more than {MOST_POSITIONS} elements");
-            return Tensor::misfit("argmax_over", &[self], problem, "cut it into shorter ones");
+            return called.misfit(&[self], problem, "cut it into shorter ones");
         }
-        let lowest = Tensor::scalar(f64::from(f32::MIN));
-        let number = self.max(&lowest).equal(self).select(self, &lowest);
+        let number = without_nan(self);
         let largest = number.equal(&number.max_over(&[axis]));
         let position = largest.select(&Tensor::index(axis).to_f32(), &Tensor::scalar(MOST_POSITIONS as f64));
         position.min_over(&[axis]).to_u32()
