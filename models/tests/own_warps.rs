@@ -328,7 +328,7 @@ fn runs_of_a_programs_warp_go_on_with_that_warp() {
     let made = |e: Experiment| e.set("optim.steps=3").unwrap().out(&run);
     made(tiny(Pushed)).train().unwrap_or_else(|e| panic!("{e}"));
     let text = std::fs::read_to_string(run.join("config.toml")).unwrap();
-    assert!(text.contains("own = \"warps::Pushed\""), "{text}");
+    assert!(text.contains("own = \"own_warps::Pushed\""), "{text}");
     fn refused<T>(result: Result<T, raygrad::Error>) -> String {
         result.err().expect("refused").to_string()
     }
@@ -336,7 +336,7 @@ fn runs_of_a_programs_warp_go_on_with_that_warp() {
     assert!(other.contains("`warp.own`") && other.contains("Pushed") && other.contains("Pulled"), "{other}");
     let of_run = || Experiment::of_run(&run).unwrap_or_else(|e| panic!("{e}"));
     let none = refused(of_run().restored());
-    assert!(none.contains("`warps::Pushed` is the warp of a program"), "{none}");
+    assert!(none.contains("`own_warps::Pushed` is the warp of a program"), "{none}");
     assert!(of_run().warp(Pushed).restored().is_ok());
     assert_eq!(of_run().layered.settings.method_name(), "Pushed");
     made(tiny(Pushed)).resume(true).train().unwrap_or_else(|e| panic!("{e}"));
